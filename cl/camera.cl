@@ -1,0 +1,152 @@
+// Paths start here, and hand in what they gathered when their slot is taken again.
+
+#include "common/features.h"
+#include "common/lanes.h"
+#include "common/layout.h"
+#include "common/pool.h"
+#include "common/rng.h"
+
+/// Hand in finished paths, give free slots the next (pixel, sample), start those whose pass may start.
+///
+/// A slot that took a sample of a pass that may not start yet keeps it and waits, so every sample is
+/// started exactly once.  Which slot gets which sample does not show in the image.
+///
+/// reads   pool, counters, pixel_order
+/// writes  pool; samples (and direct) of finished paths; counters.next_pixel, finished[], rays
+kernel void regenerate_paths(
+    __global const Params *params,
+    __global const uint *pixel_order,
+    __global float *pool,
+    volatile __global uint *counters,
+#if AOV_DIRECT
+    __global float *direct,
+#endif
+    __global float *samples)
+{
+    const uint item = get_global_id(0);
+    if (item >= params->slots / W)
+        return;
+    __global Float *path = pool_at(pool, item);
+    UInt status = get_u(path, PATH_STATUS);
+    UInt sample = get_u(path, PATH_SAMPLE);
+    UInt pixel = get_u(path, PATH_PIXEL);
+    const uint pixel_count = params->pixel_count;
+    const uint ring_mask = params->ring - 1u;
+
+    const Mask done = (status & STATUS_MASK) == STATUS_DONE;
+    if (any_lane(done)) {
+        uint lane_status[W];
+        uint lane_sample[W];
+        uint lane_pixel[W];
+        float lane_value[3][W];
+        store_lanes_u(status, lane_status);
+        store_lanes_u(sample, lane_sample);
+        store_lanes_u(pixel, lane_pixel);
+        for (uint c = 0; c < 3; ++c)
+            store_lanes(FIELD(path, PATH_RADIANCE_R + c), lane_value[c]);
+#if AOV_DIRECT
+        float lane_direct[3][W];
+        for (uint c = 0; c < 3; ++c)
+            store_lanes(FIELD(path, PATH_DIRECT_R + c), lane_direct[c]);
+#endif
+        // Neighbours mostly belong to one pass: one atomic for a run of them.
+        uint run = 0;
+        uint run_pass = 0;
+        for (uint k = 0; k < W; ++k) {
+            if ((lane_status[k] & STATUS_MASK) != STATUS_DONE)
+                continue;
+            const uint pass = lane_sample[k] & ring_mask;
+            const ulong at = (ulong)pass * pixel_count + lane_pixel[k];
+            vstore4((float4)(lane_value[0][k], lane_value[1][k], lane_value[2][k], 1.0f), at, samples);
+#if AOV_DIRECT
+            vstore4((float4)(lane_direct[0][k], lane_direct[1][k], lane_direct[2][k], 1.0f), at, direct);
+#endif
+            if (run > 0 && pass != run_pass) {
+                atomic_add(&counters[COUNTER_FINISHED + run_pass], run);
+                run = 0;
+            }
+            run_pass = pass;
+            ++run;
+        }
+        atomic_add(&counters[COUNTER_FINISHED + run_pass], run);
+    }
+
+    const Mask free = done | ((status & STATUS_MASK) == STATUS_IDLE);
+    if (any_lane(free)) {
+        const uint first = atomic_add(&counters[COUNTER_NEXT_PIXEL], count_lanes(free));
+        const uint first_pass = first / pixel_count;
+        UInt next = lanes_before(free) + (first - first_pass * pixel_count);
+        UInt pass = (UInt)(counters[COUNTER_NEXT_PASS] + first_pass);
+        // At most W steps, and only where an image has fewer pixels than a block has lanes.
+        for (uint k = 0; k < W; ++k) {
+            const Mask over = next >= pixel_count;
+            if (!any_lane(over))
+                break;
+            next = pick_u(over, next - pixel_count, next);
+            pass = pick_u(over, pass + 1u, pass);
+        }
+        sample = pick_u(free, pass, sample);
+        pixel = pick_u(free, next, pixel);
+        status = pick_u(free, (UInt)(STATUS_WAITING), status);
+        put_u(path, PATH_SAMPLE, sample);
+        put_u(path, PATH_PIXEL, pixel);
+    }
+
+    const uint limit = counters[COUNTER_PASS_LIMIT];
+    const uint window = counters[COUNTER_FILM_PASS] + params->ring;
+    const Mask start = (status == STATUS_WAITING) & (sample < min(limit, window));
+    if (any_lane(start)) {
+        atomic_add(&counters[COUNTER_PENDING_CAMERA], count_lanes(start));
+        const UInt at = pick_u(start, pixel, (UInt)(0u));
+        // x in the low half, y in the high half.
+#if W == 1
+        const UInt xy = pixel_order[at];
+#else
+        uint lane_at[W];
+        uint lane_xy[W];
+        store_lanes_u(at, lane_at);
+        for (uint k = 0; k < W; ++k)
+            lane_xy[k] = pixel_order[lane_at[k]];
+        const UInt xy = load_lanes_u(lane_xy);
+#endif
+        const UInt x = xy & 0xffffu;
+        const UInt y = xy >> 16;
+        const UInt seed = pixel_seed(y * params->width + x, params->seed);
+        Float u1;
+        Float u2;
+        sample_pair(seed, sample, (UInt)(PAIR_PIXEL), params->sampler, &u1, &u2);
+        const Float film_x =
+            ((to_float(x) + u1) * (2.0f / (float)params->width) - 1.0f) * params->film_scale_x;
+        const Float film_y =
+            (1.0f - (to_float(y) + u2) * (2.0f / (float)params->height)) * params->film_scale_y;
+        Vec3 origin = vec3_of(params->camera_origin);
+        const Vec3 right = vec3_of(params->camera_right);
+        const Vec3 up = vec3_of(params->camera_up);
+        Vec3 direction =
+            add_scaled(add_scaled(vec3_of(params->camera_forward), right, film_x), up, film_y);
+#if LENS
+        // The point that is sharp stays where it is; the origin moves over the lens (Shirley's map).
+        sample_pair(seed, sample, (UInt)(PAIR_LENS), params->sampler, &u1, &u2);
+        Float c;
+        Float s;
+        cos_sin_turns(u2, &c, &s);
+        const Float radius = sqrt(u1) * params->lens_radius;
+        const Vec3 shift = add_scaled(scale(right, radius * c), up, radius * s);
+        const Vec3 focus = add_scaled(origin, direction, (Float)(params->focus_distance));
+        origin = add(origin, shift);
+        direction = sub(focus, origin);
+#endif
+        direction = normalize3(direction);
+        const Vec3 zero = vec3_all((Float)(0.0f));
+        put_v(path, PATH_ORIGIN_X, pick_v(start, origin, get_v(path, PATH_ORIGIN_X)));
+        put_v(path, PATH_DIRECTION_X, pick_v(start, direction, get_v(path, PATH_DIRECTION_X)));
+        put_v(path, PATH_BETA_R, pick_v(start, vec3_all((Float)(1.0f)), get_v(path, PATH_BETA_R)));
+        put_v(path, PATH_RADIANCE_R, pick_v(start, zero, get_v(path, PATH_RADIANCE_R)));
+#if AOV_DIRECT
+        put_v(path, PATH_DIRECT_R, pick_v(start, zero, get_v(path, PATH_DIRECT_R)));
+#endif
+        put_u(path, PATH_SEED, pick_u(start, seed, get_u(path, PATH_SEED)));
+        status = pick_u(start, (UInt)(STATUS_ALIVE), status);
+    }
+    put_u(path, PATH_STATUS, status);
+}

@@ -1,0 +1,36 @@
+// What a scene may need: each is defined by the plan, also when it is 0.
+#pragma once
+
+#if !defined(W) || !defined(BLOCK)
+#error "W and BLOCK must be defined"
+#endif
+#ifndef TEXTURES
+#error "TEXTURES must be 0 or 1"
+#endif
+#ifndef ALPHA
+#error "ALPHA must be 0 or 1"
+#endif
+#ifndef SMOOTH
+#error "SMOOTH must be 0 or 1"
+#endif
+#ifndef TRANSMISSION
+#error "TRANSMISSION must be 0 or 1"
+#endif
+#ifndef AREA_LIGHTS
+#error "AREA_LIGHTS must be 0 or 1"
+#endif
+#ifndef PUNCTUAL_LIGHTS
+#error "PUNCTUAL_LIGHTS must be 0 or 1"
+#endif
+#ifndef ENVIRONMENT
+#error "ENVIRONMENT must be 0 (none), 1 (constant) or 2 (image)"
+#endif
+#ifndef LENS
+#error "LENS must be 0 or 1"
+#endif
+#ifndef AOV_DIRECT
+#error "AOV_DIRECT must be 0 or 1"
+#endif
+#ifndef AOV_FEATURES
+#error "AOV_FEATURES must be 0 or 1"
+#endif

@@ -1,0 +1,197 @@
+// A ray against four triangles and against eight boxes, so that no ray slips through a closed mesh.
+//
+// Watertight means: the sign of an edge function is that of its exact value for the rounded, sheared
+// corners, so two triangles that share an edge agree on which side of it the ray passes.  The rounding
+// of those corners moves them by at most 6 u times their distance from the ray's origin (u = 2^-24,
+// distance by the largest component); BOX_SLACK of that distance is added around every box, half where
+// the tree is built (the corner's part), half where the ray is set up (the origin's part).
+//
+// Woop, Benthin, Wald: Watertight Ray/Triangle Intersection, JCGT 2 (1), 2013.
+#pragma once
+
+#include "layout.h"
+
+#define BOX_SLACK 0x1p-21f // 8 u: 6 for the corners, 2 for the rounding of slack and sum
+
+// 1 + 2 gamma(3): the far distance of a box must not be rounded below its near distance.
+// Ize: Robust BVH Ray Traversal, JCGT 2 (2), 2013.
+#define BOX_FAR_FACTOR 1.0000004f
+
+// How much nearer than a hit a box must be proved to be passed over: its triangle's distance is
+// computed along another way, and equal distances must meet to let the lowest id win.
+#define CULL_FACTOR 1.000001f
+
+/// A ray; the direction need not be unit, t counts in its lengths.
+typedef struct {
+    float origin[3];
+    float direction[3];
+    float t_max; // hits are in (0, t_max)
+} Ray;
+
+/// What a ray hits first.
+typedef struct {
+    float t; // the ray's t_max if there is no hit
+    float u; // barycentric coordinate of the second corner
+    float v; // barycentric coordinate of the third corner
+    uint triangle; // index without ALPHA_BIT, or NO_HIT
+} Hit;
+
+/// What depends on the ray alone.
+typedef struct {
+    float near_origin[3]; // the origin, moved back by its slack
+    float far_origin[3]; // the origin, moved on
+    float inverse[3]; // 1 / direction; infinite for 0
+    uint near_row[3]; // row of BvhNode.bounds that the ray meets first; the other one is near_row ^ 1
+    uint axis[3]; // kx, ky, kz: kz is where the direction is longest
+    float origin[3]; // along kx, ky, kz
+    float shear[3]; // direction x / z, y / z and 1 / z along those axes
+    float t_max; // 0 if the ray is not finite, has no direction or lies beyond 2^120: it hits nothing
+} RaySetup;
+
+/// Four triangles' answers; lane k holds only where hit[k] is -1.
+typedef struct {
+    int4 hit;
+    float4 t;
+    float4 u;
+    float4 v;
+} BlockHit;
+
+static inline RaySetup make_ray_setup(const Ray ray)
+{
+    RaySetup setup;
+    const float x = fabs(ray.direction[0]);
+    const float y = fabs(ray.direction[1]);
+    const float z = fabs(ray.direction[2]);
+    const float longest = max(x, max(y, z));
+    const float reach = max(fabs(ray.origin[0]), max(fabs(ray.origin[1]), fabs(ray.origin[2])));
+    // Sums, because max() may drop a NaN; the limits keep every inverse away from 0.
+    const bool usable = x + y + z < 0x1p120f && longest > 0x1p-120f
+        && fabs(ray.origin[0]) + fabs(ray.origin[1]) + fabs(ray.origin[2]) < 0x1p120f;
+    setup.t_max = usable ? ray.t_max : 0.0f;
+
+    for (uint axis = 0; axis < 3; ++axis) {
+        const float inverse = 1.0f / ray.direction[axis];
+        const bool backward = inverse < 0.0f;
+        const float slack = backward ? -BOX_SLACK * reach : BOX_SLACK * reach;
+        setup.inverse[axis] = inverse;
+        setup.near_row[axis] = 2 * axis + (backward ? 1 : 0);
+        setup.near_origin[axis] = ray.origin[axis] + slack;
+        setup.far_origin[axis] = ray.origin[axis] - slack;
+    }
+
+    // The winding that Woop et al. keep by swapping kx and ky does not matter without culling.
+    const uint kz = x > y ? (x > z ? 0u : 2u) : (y > z ? 1u : 2u);
+    const uint kx = kz == 2u ? 0u : kz + 1u;
+    const uint ky = kx == 2u ? 0u : kx + 1u;
+    setup.axis[0] = kx;
+    setup.axis[1] = ky;
+    setup.axis[2] = kz;
+    for (uint k = 0; k < 3; ++k)
+        setup.origin[k] = ray.origin[setup.axis[k]];
+    setup.shear[0] = ray.direction[kx] / ray.direction[kz];
+    setup.shear[1] = ray.direction[ky] / ray.direction[kz];
+    setup.shear[2] = 1.0f / ray.direction[kz];
+    return setup;
+}
+
+/// a * d - b * c with the sign of the exact value (short of underflow).
+///
+/// Jeannerod, Louvet, Muller: Further Analysis of Kahan's Algorithm for the Accurate Computation of
+/// 2x2 Determinants, Mathematics of Computation 82, 2013: the relative error is at most 2 u.
+static inline float4 signed_difference(float4 a, float4 d, float4 b, float4 c)
+{
+#pragma OPENCL FP_CONTRACT OFF
+    const float4 product = b * c;
+    const float4 error = fma(-b, c, product);
+    const float4 difference = fma(a, d, -product);
+    return difference + error;
+}
+
+/// A power of two that brings the largest of the lane's numbers between 1 and 4.
+static inline float4 power_of_two_scale(float4 a, float4 b, float4 c, float4 d, float4 e, float4 f)
+{
+    const float4 largest =
+        max(max(max(fabs(a), fabs(b)), max(fabs(c), fabs(d))), max(fabs(e), fabs(f)));
+    const int4 exponent = min(as_int4(largest) & 0x7F800000, 0x7E800000);
+    return as_float4(0x7F000000 - exponent);
+}
+
+/// Intersect the four triangles of a block with the line of a ray.
+///
+/// Both sides count; degenerate and unused triangles are never hit.  Edges belong to both triangles.
+/// Coordinates of any size do: where products leave the range of float, corners are scaled first.
+static inline BlockHit intersect_block(__global const TriangleBlock *block, const RaySetup *ray)
+{
+// A contracted a * b - c * d is not the negative of c * d - a * b.
+#pragma OPENCL FP_CONTRACT OFF
+    const uint kx = ray->axis[0];
+    const uint ky = ray->axis[1];
+    const uint kz = ray->axis[2];
+    const float4 az = vload4(0, block->v[kz]) - ray->origin[2];
+    const float4 bz = vload4(0, block->v[3 + kz]) - ray->origin[2];
+    const float4 cz = vload4(0, block->v[6 + kz]) - ray->origin[2];
+    float4 ax = (vload4(0, block->v[kx]) - ray->origin[0]) - ray->shear[0] * az;
+    float4 bx = (vload4(0, block->v[3 + kx]) - ray->origin[0]) - ray->shear[0] * bz;
+    float4 cx = (vload4(0, block->v[6 + kx]) - ray->origin[0]) - ray->shear[0] * cz;
+    float4 ay = (vload4(0, block->v[ky]) - ray->origin[1]) - ray->shear[1] * az;
+    float4 by = (vload4(0, block->v[3 + ky]) - ray->origin[1]) - ray->shear[1] * bz;
+    float4 cy = (vload4(0, block->v[6 + ky]) - ray->origin[1]) - ray->shear[1] * cz;
+
+    float4 u = cx * by - cy * bx;
+    float4 v = ax * cy - ay * cx;
+    float4 w = bx * ay - by * ax;
+    int4 outside = ((u < 0.0f) | (v < 0.0f) | (w < 0.0f)) & ((u > 0.0f) | (v > 0.0f) | (w > 0.0f));
+    const int4 used = vload4(0, block->id) != (uint4)(NO_HIT);
+    BlockHit found;
+    found.hit = used & ~outside;
+    if (!any(found.hit))
+        return found;
+
+    float4 determinant = u + v + w;
+    const int4 doubtful = (u == 0.0f) | (v == 0.0f) | (w == 0.0f)
+        | ~((fabs(determinant) > 0x1p-100f) & (fabs(determinant) < 0x1p100f));
+    if (any(found.hit & doubtful)) {
+        const float4 scale = power_of_two_scale(ax, bx, cx, ay, by, cy);
+        ax *= scale;
+        bx *= scale;
+        cx *= scale;
+        ay *= scale;
+        by *= scale;
+        cy *= scale;
+        u = signed_difference(cx, by, cy, bx);
+        v = signed_difference(ax, cy, ay, cx);
+        w = signed_difference(bx, ay, by, ax);
+        outside = ((u < 0.0f) | (v < 0.0f) | (w < 0.0f)) & ((u > 0.0f) | (v > 0.0f) | (w > 0.0f));
+        found.hit &= ~outside;
+        determinant = u + v + w;
+    }
+    const float4 inverse = 1.0f / determinant;
+    found.u = v * inverse;
+    found.v = w * inverse;
+    // Weighting the corners' distances keeps t between them, however small the determinant.
+    found.t = (u * inverse) * (az * ray->shear[2]) + found.u * (bz * ray->shear[2])
+        + found.v * (cz * ray->shear[2]);
+    // A determinant of 0 makes t NaN or infinite, and that is not in front.
+    found.hit &= (found.t > 0.0f) & (found.t < INFINITY);
+    return found;
+}
+
+/// Return which of a node's eight children the ray may meet before `limit`, and where it enters them.
+///
+/// Conservative.  Minima and maxima drop NaN (an infinite inverse times 0: the ray slides along a
+/// face, which does not bound it), and empty children are entered at infinity.
+static inline int8 intersect_boxes(
+    __global const BvhNode *node, const RaySetup *ray, float limit, float8 *entry)
+{
+    float8 near = (float8)(0.0f);
+    float8 far = (float8)(limit);
+    for (uint axis = 0; axis < 3; ++axis) {
+        const uint row = ray->near_row[axis];
+        const float8 enter = (vload8(0, node->bounds[row]) - ray->near_origin[axis]) * ray->inverse[axis];
+        const float8 leave = (vload8(0, node->bounds[row ^ 1u]) - ray->far_origin[axis]) * ray->inverse[axis];
+        near = enter > near ? enter : near;
+        far = leave < far ? leave : far;
+    }
+    *entry = near;
+    return near <= far * BOX_FAR_FACTOR;
+}

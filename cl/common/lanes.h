@@ -1,0 +1,203 @@
+// W paths at once: one text for W = 1 (a GPU, and the plain meaning of the code), 8 and 16 (a CPU).
+//
+// Float, UInt and Mask hold one value a lane; operators work lane by lane.  A branch on data is
+// pick(mask, then, otherwise).  A Mask is 0 or -1 (0 or 1 for W = 1): combine it with & | and !, never
+// with ~.  Dead lanes may hold anything: mask them by pick, never by multiplying with 0.
+#pragma once
+
+#define JOIN_(a, b) a##b
+#define JOIN(a, b) JOIN_(a, b)
+
+#if W == 1
+typedef float Float;
+typedef int Int;
+typedef uint UInt;
+typedef int Mask;
+#elif W == 8 || W == 16
+typedef JOIN(float, W) Float;
+typedef JOIN(int, W) Int;
+typedef JOIN(uint, W) UInt;
+typedef JOIN(int, W) Mask;
+#else
+#error "W must be 1, 8 or 16"
+#endif
+
+// pick(mask, then, otherwise) for Float, pick_u for UInt, pick_m for Mask;
+// count_lanes(mask): how many; any_lane(mask): whether one; lanes_before(mask): how many lower ones a lane has.
+// GATHER(array, index, member): array[index].member of every lane, GATHER_U the same for uint.
+#if W == 1
+inline float pick(int mask, float then, float otherwise) { return mask ? then : otherwise; }
+inline uint pick_u(int mask, uint then, uint otherwise) { return mask ? then : otherwise; }
+inline int any_lane(int mask) { return mask != 0; }
+inline uint count_lanes(int mask) { return mask != 0; }
+inline uint lanes_before(int mask) { return 0; }
+inline float to_float(uint x) { return (float)x; }
+inline uint to_uint(float x) { return (uint)x; }
+inline uint as_bits(float x) { return as_uint(x); }
+inline float from_bits(uint x) { return as_float(x); }
+inline void store_lanes(float x, float *array) { array[0] = x; }
+inline void store_lanes_u(uint x, uint *array) { array[0] = x; }
+inline float load_lanes(const float *array) { return array[0]; }
+inline uint load_lanes_u(const uint *array) { return array[0]; }
+#define GATHER(array, index, member) ((array)[index].member)
+#define GATHER_U(array, index, member) ((array)[index].member)
+#else
+inline Float pick(Mask mask, Float then, Float otherwise) { return select(otherwise, then, mask); }
+inline UInt pick_u(Mask mask, UInt then, UInt otherwise) { return select(otherwise, then, mask); }
+inline int any_lane(Mask mask) { return any(mask); }
+inline Float to_float(UInt x) { return JOIN(convert_float, W)(x); }
+inline UInt to_uint(Float x) { return JOIN(convert_uint, W)(x); }
+inline UInt as_bits(Float x) { return JOIN(as_uint, W)(x); }
+inline Float from_bits(UInt x) { return JOIN(as_float, W)(x); }
+inline void store_lanes(Float x, float *array) { JOIN(vstore, W)(x, 0, array); }
+inline void store_lanes_u(UInt x, uint *array) { JOIN(vstore, W)(x, 0, array); }
+inline Float load_lanes(const float *array) { return JOIN(vload, W)(0, array); }
+inline UInt load_lanes_u(const uint *array) { return JOIN(vload, W)(0, array); }
+#if W == 8
+inline uint count_lanes(Mask mask)
+{
+    const int4 a = mask.lo + mask.hi;
+    const int2 b = a.lo + a.hi;
+    return (uint)(-(b.x + b.y));
+}
+#define GATHER_(type, array, i, member)                                                            \
+    ((type)((array)[(i).s0].member, (array)[(i).s1].member, (array)[(i).s2].member,                \
+            (array)[(i).s3].member, (array)[(i).s4].member, (array)[(i).s5].member,                \
+            (array)[(i).s6].member, (array)[(i).s7].member))
+#else
+inline uint count_lanes(Mask mask)
+{
+    const int8 a = mask.lo + mask.hi;
+    const int4 b = a.lo + a.hi;
+    const int2 c = b.lo + b.hi;
+    return (uint)(-(c.x + c.y));
+}
+#define GATHER_(type, array, i, member)                                                            \
+    ((type)((array)[(i).s0].member, (array)[(i).s1].member, (array)[(i).s2].member,                \
+            (array)[(i).s3].member, (array)[(i).s4].member, (array)[(i).s5].member,                \
+            (array)[(i).s6].member, (array)[(i).s7].member, (array)[(i).s8].member,                \
+            (array)[(i).s9].member, (array)[(i).sa].member, (array)[(i).sb].member,                \
+            (array)[(i).sc].member, (array)[(i).sd].member, (array)[(i).se].member,                \
+            (array)[(i).sf].member))
+#endif
+inline UInt lanes_before(Mask mask)
+{
+    int lane[W];
+    uint before[W];
+    JOIN(vstore, W)(mask, 0, lane);
+    uint sum = 0;
+    for (uint k = 0; k < W; ++k) {
+        before[k] = sum;
+        sum -= lane[k];
+    }
+    return load_lanes_u(before);
+}
+#define GATHER(array, index, member) GATHER_(Float, array, index, member)
+#define GATHER_U(array, index, member) GATHER_(UInt, array, index, member)
+#endif
+
+#define MASK_ALL ((Mask)(-1))
+
+#define PI 3.14159265358979f
+#define INV_PI 0.318309886183791f
+#define ONE_BELOW 0.99999994f
+
+/// Three values a lane: a vector, a point or a colour.
+typedef struct {
+    Float x;
+    Float y;
+    Float z;
+} Vec3;
+
+inline Vec3 vec3(Float x, Float y, Float z)
+{
+    Vec3 v;
+    v.x = x;
+    v.y = y;
+    v.z = z;
+    return v;
+}
+inline Vec3 vec3_of(const __global float *p) { return vec3((Float)(p[0]), (Float)(p[1]), (Float)(p[2])); }
+inline Vec3 vec3_all(Float x) { return vec3(x, x, x); }
+inline Vec3 add(Vec3 a, Vec3 b) { return vec3(a.x + b.x, a.y + b.y, a.z + b.z); }
+inline Vec3 sub(Vec3 a, Vec3 b) { return vec3(a.x - b.x, a.y - b.y, a.z - b.z); }
+inline Vec3 mul(Vec3 a, Vec3 b) { return vec3(a.x * b.x, a.y * b.y, a.z * b.z); }
+inline Vec3 scale(Vec3 a, Float s) { return vec3(a.x * s, a.y * s, a.z * s); }
+inline Vec3 add_scaled(Vec3 a, Vec3 b, Float s) { return vec3(a.x + b.x * s, a.y + b.y * s, a.z + b.z * s); }
+inline Float dot3(Vec3 a, Vec3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+inline Vec3 cross3(Vec3 a, Vec3 b)
+{
+    return vec3(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x);
+}
+inline Vec3 pick_v(Mask mask, Vec3 then, Vec3 otherwise)
+{
+    return vec3(pick(mask, then.x, otherwise.x), pick(mask, then.y, otherwise.y),
+                pick(mask, then.z, otherwise.z));
+}
+inline Vec3 lerp3(Vec3 a, Vec3 b, Float t) { return add_scaled(a, sub(b, a), t); }
+inline Float max3(Vec3 a) { return max(a.x, max(a.y, a.z)); }
+inline Float luminance(Vec3 c) { return 0.2126f * c.x + 0.7152f * c.y + 0.0722f * c.z; }
+
+/// Unit vector along `v`, also where the square of its length would leave the range of float;
+/// (0, 0, 1) where `v` has no direction.
+inline Vec3 normalize3(Vec3 v)
+{
+    const Float largest = max(fabs(v.x), max(fabs(v.y), fabs(v.z)));
+    const Mask ok = (largest > 0.0f) & (largest < INFINITY);
+    const Vec3 s = scale(v, 1.0f / pick(ok, largest, (Float)(1.0f)));
+    const Vec3 unit = scale(s, 1.0f / sqrt(dot3(s, s)));
+    return pick_v(ok, unit, vec3((Float)(0.0f), (Float)(0.0f), (Float)(1.0f)));
+}
+
+/// Two unit vectors that make a right-handed frame with the unit vector `n`.
+///
+/// Duff et al.: Building an Orthonormal Basis, Revisited, JCGT 6 (1), 2017.
+inline void make_frame(Vec3 n, Vec3 *s, Vec3 *t)
+{
+    const Float sign = pick(n.z >= 0.0f, (Float)(1.0f), (Float)(-1.0f));
+    const Float a = -1.0f / (sign + n.z);
+    const Float b = n.x * n.y * a;
+    *s = vec3(1.0f + sign * n.x * n.x * a, sign * b, -sign * n.x);
+    *t = vec3(b, sign + n.y * n.y * a, -n.y);
+}
+
+/// Cosine and sine of 2 pi `turns`, for `turns` in [0, 1]; Taylor series on an eighth of a turn
+/// (error below 1e-7).  Library calls are scalar on PoCL: 30 ns each.
+inline void cos_sin_turns(Float turns, Float *cosine, Float *sine)
+{
+    const Float quarter = floor(turns * 4.0f + 0.5f);
+    const Float x = (turns * 4.0f - quarter) * 1.57079632679490f;
+    const Float y = x * x;
+    const Float s =
+        x * (1.0f + y * (-1.6666667e-1f + y * (8.3333333e-3f + y * (-1.9841270e-4f + y * 2.7557319e-6f))));
+    const Float c =
+        1.0f
+        + y * (-0.5f + y * (4.1666667e-2f + y * (-1.3888889e-3f + y * (2.4801587e-5f + y * -2.7557319e-7f))));
+    const UInt q = to_uint(quarter);
+    const Mask swap = (q & 1u) != 0u;
+    const Mask cosine_minus = ((q + 1u) & 2u) != 0u;
+    const Mask sine_minus = (q & 2u) != 0u;
+    const Float ca = pick(swap, s, c);
+    const Float sa = pick(swap, c, s);
+    *cosine = pick(cosine_minus, -ca, ca);
+    *sine = pick(sine_minus, -sa, sa);
+}
+
+/// Angle of (x, y) from the positive x axis in (-pi, pi]; 0 for (0, 0).
+///
+/// Two half-angle steps bring the ratio below 0.2, where the series to x^9 is exact to float.
+inline Float atan2_lanes(Float y, Float x)
+{
+    const Float ax = fabs(x);
+    const Float ay = fabs(y);
+    const Float longer = max(ax, ay);
+    const Float ratio = min(ax, ay) / pick(longer > 0.0f, longer, (Float)(1.0f));
+    const Float half_ratio = ratio / (1.0f + sqrt(1.0f + ratio * ratio));
+    const Float r = half_ratio / (1.0f + sqrt(1.0f + half_ratio * half_ratio));
+    const Float z = r * r;
+    Float angle =
+        4.0f * r * (1.0f + z * (-3.3333333e-1f + z * (0.2f + z * (-1.4285714e-1f + z * 1.1111111e-1f))));
+    angle = pick(ay > ax, 1.57079632679490f - angle, angle);
+    angle = pick(x < 0.0f, PI - angle, angle);
+    return pick(y < 0.0f, -angle, angle);
+}

@@ -1,0 +1,218 @@
+// Written by tools/make_layout.py from psf_cl/device/layout.py: change that, then run it.
+#pragma once
+
+#define LEAF_BIT 0x80000000u // child[] is a block of triangles
+#define ALPHA_BIT 0x80000000u // id[] needs its alpha looked up
+#define NO_HIT 0xFFFFFFFFu
+#define NO_LIGHT 0xFFFFFFFFu
+#define NO_TEXTURE 0xFFFFFFFFu
+#define MATERIAL_TWO_SIDED_EMISSION 1u
+#define MATERIAL_ALPHA_MASK 2u
+#define TEXTURE_CLAMP_U 1u
+#define TEXTURE_MIRROR_U 2u
+#define TEXTURE_CLAMP_V 4u
+#define TEXTURE_MIRROR_V 8u
+#define TEXTURE_NEAREST 16u
+#define TEXTURE_SRGB 32u
+#define LIGHT_TRIANGLE 0u
+#define LIGHT_ENVIRONMENT 1u
+#define LIGHT_POINT 2u
+#define LIGHT_SPOT 3u
+#define LIGHT_DIRECTIONAL 4u
+#define DIRECT_MIS 0u
+#define DIRECT_LIGHT 1u
+#define DIRECT_BSDF 2u
+#define SAMPLER_SOBOL 0u
+#define SAMPLER_RANDOM 1u
+#define STATUS_IDLE 0u // the slot has no path yet
+#define STATUS_WAITING 0x40000000u // it holds a sample whose pass may not start yet
+#define STATUS_ALIVE 0x80000000u // it traces a ray
+#define STATUS_DONE 0xC0000000u // the path ended, the film does not have it yet
+#define STATUS_MASK 0xC0000000u
+#define DEPTH_MASK 0x3FFFFFFFu // bounces so far
+
+#define PATH_ORIGIN_X 0u // ray origin, world, m
+#define PATH_ORIGIN_Y 1u
+#define PATH_ORIGIN_Z 2u
+#define PATH_DIRECTION_X 3u // unit ray direction
+#define PATH_DIRECTION_Y 4u
+#define PATH_DIRECTION_Z 5u
+#define PATH_HIT_TRIANGLE 6u // uint; NO_HIT if the ray left the scene
+#define PATH_HIT_T 7u // m
+#define PATH_HIT_U 8u // barycentric coordinate of the second corner
+#define PATH_HIT_V 9u // barycentric coordinate of the third corner
+#define PATH_BETA_R 10u // throughput
+#define PATH_BETA_G 11u
+#define PATH_BETA_B 12u
+#define PATH_RADIANCE_R 13u // gathered so far
+#define PATH_RADIANCE_G 14u
+#define PATH_RADIANCE_B 15u
+#define PATH_DIRECT_R 16u // of that, what light reflected at most once brought
+#define PATH_DIRECT_G 17u
+#define PATH_DIRECT_B 18u
+#define PATH_PDF 19u // solid-angle density of the ray's direction; 0 if it could not be light-sampled
+#define PATH_STATUS 20u // uint; STATUS_* bits and the depth
+#define PATH_SAMPLE 21u // uint; index of the sample, which is its pass
+#define PATH_PIXEL 22u // uint; position in the order of pixels
+#define PATH_SEED 23u // uint; of the pixel, by its place on the film
+#define PATH_SHADOW_X 24u // shadow ray origin, world, m
+#define PATH_SHADOW_Y 25u
+#define PATH_SHADOW_Z 26u
+#define PATH_TOWARD_X 27u // from there to the light, not normalised: the light is at t = 1
+#define PATH_TOWARD_Y 28u
+#define PATH_TOWARD_Z 29u
+#define PATH_LIGHT_R 30u // radiance that arrives if nothing is in between, times beta; all 0: no ray
+#define PATH_LIGHT_G 31u
+#define PATH_LIGHT_B 32u
+#define PATH_FIELD_COUNT 33u
+
+#define COUNTER_NEXT_PIXEL 0u // next pixel to be started, counted from the first pixel of next_pass
+#define COUNTER_NEXT_PASS 1u // pass that next_pixel 0 belongs to
+#define COUNTER_FILM_PASS 2u // passes that the film holds
+#define COUNTER_PASS_LIMIT 3u // first pass that must not be started; set by the host
+#define COUNTER_CAMERA_RAYS 4u // low word
+#define COUNTER_CAMERA_RAYS_HIGH 5u // high word
+#define COUNTER_BOUNCE_RAYS 6u // low word
+#define COUNTER_BOUNCE_RAYS_HIGH 7u // high word
+#define COUNTER_SHADOW_RAYS 8u // low word
+#define COUNTER_SHADOW_RAYS_HIGH 9u // high word
+#define COUNTER_REJECTED_SAMPLES 10u // samples that were not finite or negative
+#define COUNTER_PENDING_CAMERA 11u // rays since the last film launch
+#define COUNTER_PENDING_BOUNCE 12u
+#define COUNTER_PENDING_SHADOW 13u
+#define COUNTER_STACK_OVERFLOWS 14u // traversal stacks that were full
+#define COUNTER_FINISHED 15u // first of the ring: samples done of each pass in flight
+
+/// Everything that is the same for all paths of a render.
+typedef struct {
+    float camera_origin[3]; // world, m
+    float lens_radius; // m
+    float camera_right[3]; // unit, world
+    float focus_distance; // m
+    float camera_up[3]; // unit, world
+    float film_scale_x; // tangent of half the horizontal field of view
+    float camera_forward[3]; // unit, world
+    float film_scale_y; // tangent of half the vertical field of view
+    uint width; // pixels of the whole film
+    uint height; // pixels of the whole film
+    uint crop_x; // first column that is rendered
+    uint crop_y; // first row that is rendered
+    uint crop_width; // columns that are rendered
+    uint pixel_count; // pixels that are rendered
+    uint ring; // passes that may be in flight
+    uint slots; // paths of the pool
+    uint seed; // start of every random sequence
+    uint max_depth; // bounces
+    uint roulette_depth; // bounces before roulette
+    uint light_count; // entries of the light table
+    uint triangle_count; // entries of the triangle tables
+    uint material_count; // entries of the material table
+    uint environment_width; // texels
+    uint environment_height; // texels
+    float environment_radiance[3]; // constant sky, or factor of the image
+    float environment_pmf; // chance that the light table picks the environment
+    float environment_rotation[9]; // world to local, row-major
+    float scene_radius; // m, of the bounding sphere
+    uint direct_sampling; // DIRECT_MIS, DIRECT_LIGHT or DIRECT_BSDF
+    uint sampler; // SAMPLER_SOBOL or SAMPLER_RANDOM
+} Params;
+
+/// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.
+typedef struct {
+    float bounds[6][8]; // x low, x high, y low, y high, z low, z high of each child; an empty one is inverted
+    uint child[8]; // node index, or LEAF_BIT | block index
+    uint unused[8]; // fills the cache line
+} BvhNode;
+
+/// A leaf: up to four triangles side by side; an unused one is all NaN.
+typedef struct {
+    float v[9][4]; // vertex * 3 + axis; world, m
+    uint id[4]; // triangle index, ALPHA_BIT set if its alpha must be looked up
+} TriangleBlock;
+
+/// A triangle as shading needs it.
+typedef struct {
+    float p0[3]; // first vertex; world, m
+    uint material; // index into the materials
+    float e1[3]; // second vertex minus first
+    uint light; // index into the light table, NO_LIGHT if it does not emit
+    float e2[3]; // third vertex minus first
+    float flip; // -1 if the instance's transform mirrors the mesh, else 1
+} Surface;
+
+/// Shading normals of a triangle's corners; all zero if it is flat.
+typedef struct {
+    float n0[3]; // unit, world
+    float pad0; // fills the word
+    float n1[3]; // unit, world
+    float pad1; // fills the word
+    float n2[3]; // unit, world
+    float pad2; // fills the word
+} Normals;
+
+/// Texture coordinates of a triangle's corners.
+typedef struct {
+    float uv0[2]; // first corner
+    float uv1[2]; // second corner
+    float uv2[2]; // third corner
+    float pad[2]; // fills the record
+} Uvs;
+
+/// Parameters of the one BSDF.
+typedef struct {
+    float base_color[3]; // linear Rec.709
+    float metallic; // 0 dielectric, 1 metal
+    float emission[3]; // radiance
+    float alpha_ggx; // roughness squared
+    float f0; // dielectric reflectance at normal incidence times specular
+    float specular; // F90 of the dielectric; 0 for pure diffuse
+    float ior; // index of refraction
+    float transmission; // 0 opaque, 1 glass
+    uint base_color_texture; // index, NO_TEXTURE for none
+    uint emission_texture; // index, NO_TEXTURE for none
+    uint flags; // MATERIAL_TWO_SIDED_EMISSION, MATERIAL_ALPHA_MASK
+    float alpha_cutoff; // of the mask, divided by the alpha factor
+} Material;
+
+/// Where a texture's texels are.
+typedef struct {
+    uint offset; // first texel
+    uint width; // texels
+    uint height; // texels
+    uint flags; // TEXTURE_* bits: wrap of u and v, nearest, sRGB
+} TextureInfo;
+
+/// An emitter of the light table.
+typedef struct {
+    uint kind; // LIGHT_TRIANGLE, LIGHT_ENVIRONMENT, LIGHT_POINT, LIGHT_SPOT or LIGHT_DIRECTIONAL
+    uint triangle; // index, for LIGHT_TRIANGLE
+    float pmf; // chance to be picked
+    float keep; // alias table: chance that the slot keeps its own index
+    float position[3]; // world, m
+    uint other; // alias table: the index otherwise
+    float direction[3]; // unit, the way the light travels
+    float range; // m, inf for none
+    float intensity[3]; // candela or lux
+    float cos_outer; // of the cone
+    float spot_scale; // 1 / (cos inner - cos outer), floored
+    float pad[3]; // fills the record
+} Light;
+
+/// A texel of the environment: radiance and its slot of the alias table.
+typedef struct {
+    float radiance[3]; // before the factor
+    float pmf; // chance of the texel
+    float keep; // alias table
+    uint other; // alias table
+    float pad[2]; // fills the record
+} EnvironmentCell;
+
+/// All samples of one pixel of one plane.
+typedef struct {
+    float sum[3]; // of the values
+    uint count; // samples
+    float lost[3]; // what the sums lost by rounding
+    float mean; // running mean of the luminance
+    float squares; // sum of squared deviations from it
+    float pad[3]; // fills the record
+} FilmSum;

@@ -1,0 +1,288 @@
+// Emitters: the light table, its sampling and its densities; the environment.
+#pragma once
+
+#include "lanes.h"
+#include "layout.h"
+#include "rng.h"
+#include "surface.h"
+
+/// Light that arrives at a point from one sampled direction.
+typedef struct {
+    Vec3 toward;      // from the point to the light, m, not normalised
+    Vec3 wi;          // the same, unit
+    Vec3 radiance;    // divided by nothing; per unit of `pdf`
+    Float pdf;        // solid angle, times the chance of the light; of a light without extent, the chance
+    Mask extended;    // whether a BSDF sample could find this light too
+} LightSample;
+
+/// Slot of an alias table for 32 random bits and a second number; `keep` and `other` are the slot's.
+///
+/// Vose: A Linear Algorithm for Generating Random Numbers with a Given Distribution, 1991.
+inline UInt alias_slot(UInt bits, uint count) { return mul_hi(bits, (UInt)(count)); }
+
+inline Float power_heuristic(Float a, Float b)
+{
+    // Divided by the larger first: densities of tiny lights overflow when they are squared.
+    const Float largest = max(max(a, b), 1e-30f);
+    const Float x = a / largest;
+    const Float y = b / largest;
+    return x * x / max(x * x + y * y, 1e-30f);
+}
+
+#if ENVIRONMENT == 2
+/// Texture coordinates of a world direction, and the sine of its angle from the zenith.
+inline void environment_uv(__global const Params *params, Vec3 d, Float *u, Float *v, Float *sine)
+{
+    __global const float *m = params->environment_rotation;
+    const Vec3 l = vec3(m[0] * d.x + m[1] * d.y + m[2] * d.z, m[3] * d.x + m[4] * d.y + m[5] * d.z,
+                        m[6] * d.x + m[7] * d.y + m[8] * d.z);
+    *sine = sqrt(l.x * l.x + l.z * l.z);
+    const Float turns = atan2_lanes(l.x, -l.z) * (0.5f * INV_PI);
+    *u = pick(turns < 0.0f, turns + 1.0f, turns);
+    *v = atan2_lanes(*sine, l.y) * INV_PI;
+}
+
+/// Index of a cell; columns wrap, rows end.
+inline UInt environment_cell(__global const Params *params, Float x, Float y)
+{
+    const Float width = (Float)((float)params->environment_width);
+    const Float height = (Float)((float)params->environment_height);
+    const Float column = pick(x < 0.0f, x + width, pick(x >= width, x - width, x));
+    const UInt i = min(to_uint(max(column, 0.0f)), (UInt)(params->environment_width - 1u));
+    const UInt j = min(to_uint(clamp(y, (Float)(0.0f), height - 1.0f)), (UInt)(params->environment_height - 1u));
+    return j * params->environment_width + i;
+}
+
+/// Chance per solid angle of the cell at (u, v).
+inline Float environment_density(
+    __global const Params *params, __global const EnvironmentCell *cells, UInt cell, Float sine)
+{
+    const float count = (float)params->environment_width * (float)params->environment_height;
+    const Float pdf = GATHER(cells, cell, pmf) * (count * 0.5f * INV_PI * INV_PI) / max(sine, 1e-9f);
+    return pick(sine > 1e-7f, pdf, (Float)(0.0f));
+}
+
+/// Bilinear radiance at (u, v).
+inline Vec3 environment_look_up(
+    __global const Params *params, __global const EnvironmentCell *cells, Float u, Float v)
+{
+    const Float x = u * (float)params->environment_width - 0.5f;
+    const Float y = v * (float)params->environment_height - 0.5f;
+    const Float x0 = floor(x);
+    const Float y0 = floor(y);
+    const Float fx = x - x0;
+    const Float fy = y - y0;
+    Vec3 sum = vec3_all((Float)(0.0f));
+    for (uint k = 0; k < 4; ++k) {
+        const Float weight = ((k & 1u) ? fx : 1.0f - fx) * ((k & 2u) ? fy : 1.0f - fy);
+        const UInt cell = environment_cell(params, x0 + (float)(k & 1u), y0 + (float)(k >> 1));
+        const Vec3 c = vec3(GATHER(cells, cell, radiance[0]), GATHER(cells, cell, radiance[1]),
+                            GATHER(cells, cell, radiance[2]));
+        sum = add_scaled(sum, c, weight);
+    }
+    return sum;
+}
+#endif
+
+#if ENVIRONMENT
+/// Radiance from direction `d`, and the density with which sample_light draws it.
+inline Vec3 eval_environment(
+    __global const Params *params,
+#if ENVIRONMENT == 2
+    __global const EnvironmentCell *cells,
+#endif
+    Vec3 d,
+    Float *pdf)
+{
+    const Vec3 factor = vec3_of(params->environment_radiance);
+#if ENVIRONMENT == 2
+    Float u;
+    Float v;
+    Float sine;
+    environment_uv(params, d, &u, &v, &sine);
+    const UInt cell = environment_cell(params, u * (float)params->environment_width,
+                                       v * (float)params->environment_height);
+    *pdf = params->environment_pmf * environment_density(params, cells, cell, sine);
+    return mul(factor, environment_look_up(params, cells, u, v));
+#else
+    *pdf = (Float)(params->environment_pmf * 0.25f * INV_PI);
+    return factor;
+#endif
+}
+#endif
+
+#if AREA_LIGHTS
+/// Density per solid angle with which sample_light draws a point at distance `t` on an emitter.
+inline Float area_light_density(
+    __global const Light *lights, UInt light, Float t, Float cosine, Float area)
+{
+    const Float pdf = GATHER(lights, light, pmf) * t * t / max(cosine * area, 1e-30f);
+    return pick((cosine > 0.0f) & (area > 0.0f), pdf, (Float)(0.0f));
+}
+#endif
+
+/// Draw a light, then a direction to it, from point `p` whose ray origin is `origin`.
+///
+/// pdf is 0 where nothing arrives.  `seed`, `sample` and `pair` (the vertex's first) name the numbers.
+inline LightSample sample_light(
+    __global const Params *params,
+    __global const Light *lights,
+    __global const Surface *surfaces,
+    __global const Material *materials,
+#if TEXTURES
+    __global const Uvs *uvs,
+    __global const TextureInfo *textures,
+    __global const uchar4 *texels,
+    __global const float *srgb_to_linear,
+#endif
+#if ENVIRONMENT == 2
+    __global const EnvironmentCell *cells,
+#endif
+    Mask active,
+    Vec3 origin,
+    UInt seed,
+    UInt sample,
+    UInt pair,
+    UInt choice_bits,
+    Float alias_u)
+{
+    Float u1;
+    Float u2;
+    sample_pair(seed, sample, pair + PAIR_LIGHT, params->sampler, &u1, &u2);
+
+    UInt light = alias_slot(choice_bits, params->light_count);
+    light = pick_u(alias_u < GATHER(lights, light, keep), light, GATHER_U(lights, light, other));
+    const UInt kind = GATHER_U(lights, light, kind);
+    const Float pmf = GATHER(lights, light, pmf);
+
+    LightSample s;
+    s.toward = vec3((Float)(0.0f), (Float)(0.0f), (Float)(1.0f));
+    s.radiance = vec3_all((Float)(0.0f));
+    s.pdf = (Float)(0.0f);
+    s.extended = MASK_ALL;
+    s.wi = s.toward;
+
+#if AREA_LIGHTS
+    const Mask on_triangle = active & (kind == LIGHT_TRIANGLE);
+    if (any_lane(on_triangle)) {
+        const UInt triangle = pick_u(on_triangle, GATHER_U(lights, light, triangle), (UInt)(0u));
+        const Vec3 p0 = vec3(GATHER(surfaces, triangle, p0[0]), GATHER(surfaces, triangle, p0[1]),
+                             GATHER(surfaces, triangle, p0[2]));
+        const Vec3 e1 = vec3(GATHER(surfaces, triangle, e1[0]), GATHER(surfaces, triangle, e1[1]),
+                             GATHER(surfaces, triangle, e1[2]));
+        const Vec3 e2 = vec3(GATHER(surfaces, triangle, e2[0]), GATHER(surfaces, triangle, e2[1]),
+                             GATHER(surfaces, triangle, e2[2]));
+        // Uniform on the triangle, without folding, so that strata stay connected.
+        const Float root = sqrt(u1);
+        const Float b1 = root * (1.0f - u2);
+        const Float b2 = root * u2;
+        const Vec3 cross = cross3(e1, e2);
+        const Vec3 ng = scale(normalize3(cross), GATHER(surfaces, triangle, flip));
+        const Float area = 0.5f * sqrt(dot3(cross, cross));
+        Vec3 q = add_scaled(add_scaled(p0, e1, b1), e2, b2);
+        const Float side = pick(dot3(ng, sub(origin, q)) >= 0.0f, (Float)(1.0f), (Float)(-1.0f));
+        const Float extent =
+            max(fabs(p0.x) + fabs(e1.x) + fabs(e2.x),
+                max(fabs(p0.y) + fabs(e1.y) + fabs(e2.y), fabs(p0.z) + fabs(e1.z) + fabs(e2.z)));
+        q = add_scaled(q, ng, side * extent * OFFSET_EPSILON);
+        const Vec3 toward = sub(q, origin);
+        const Vec3 wi = normalize3(toward);
+        const UInt material = GATHER_U(surfaces, triangle, material);
+        const Mask two_sided = (GATHER_U(materials, material, flags) & MATERIAL_TWO_SIDED_EMISSION) != 0u;
+        const Float cosine = -dot3(ng, wi);
+        const Mask lit = on_triangle & ((cosine > 0.0f) | two_sided) & (area > 0.0f);
+        Vec3 emission = vec3(GATHER(materials, material, emission[0]), GATHER(materials, material, emission[1]),
+                             GATHER(materials, material, emission[2]));
+#if TEXTURES
+        emission = textured(lit, emission, GATHER_U(materials, material, emission_texture), triangle, b1,
+                            b2, uvs, textures, texels, srgb_to_linear);
+#endif
+        const Float pdf = pmf * dot3(toward, toward) / max(fabs(cosine) * area, 1e-30f);
+        s.toward = pick_v(lit, toward, s.toward);
+        s.wi = pick_v(lit, wi, s.wi);
+        s.radiance = pick_v(lit, emission, s.radiance);
+        s.pdf = pick(lit & (cosine != 0.0f), pdf, s.pdf);
+    }
+#endif
+
+#if ENVIRONMENT
+    const Mask in_sky = active & (kind == LIGHT_ENVIRONMENT);
+    if (any_lane(in_sky)) {
+#if ENVIRONMENT == 2
+        UInt index_bits;
+        UInt alias_bits;
+        sample_bits(seed, sample, pair + PAIR_ENVIRONMENT, params->sampler, &index_bits, &alias_bits);
+        const uint width = params->environment_width;
+        const uint height = params->environment_height;
+        UInt cell = alias_slot(index_bits, width * height);
+        cell = pick_u(unit_float(alias_bits) < GATHER(cells, cell, keep), cell, GATHER_U(cells, cell, other));
+        // float division of indices below 2^24 is exact enough to floor: the remainder is corrected.
+        UInt row = to_uint(to_float(cell) / (float)width);
+        row = pick_u(row * width > cell, row - 1u, row);
+        row = pick_u(cell - row * width >= width, row + 1u, row);
+        const Float u = (to_float(cell - row * width) + u1) / (float)width;
+        const Float v = (to_float(row) + u2) / (float)height;
+        Float sine;
+        Float cosine;
+        Float c;
+        Float si;
+        cos_sin_turns(v * 0.5f, &cosine, &sine);
+        cos_sin_turns(u, &c, &si);
+        const Vec3 l = vec3(sine * si, cosine, -sine * c);
+        __global const float *m = params->environment_rotation;
+        const Vec3 wi = vec3(m[0] * l.x + m[3] * l.y + m[6] * l.z, m[1] * l.x + m[4] * l.y + m[7] * l.z,
+                             m[2] * l.x + m[5] * l.y + m[8] * l.z);
+        const Float pdf = pmf * environment_density(params, cells, cell, sine);
+        const Vec3 radiance =
+            mul(vec3_of(params->environment_radiance), environment_look_up(params, cells, u, v));
+#else
+        const Float z = 1.0f - 2.0f * u1;
+        const Float radius = sqrt(max(1.0f - z * z, 0.0f));
+        Float c;
+        Float si;
+        cos_sin_turns(u2, &c, &si);
+        const Vec3 wi = vec3(radius * c, z, radius * si);
+        const Float pdf = pmf * (0.25f * INV_PI);
+        const Vec3 radiance = vec3_of(params->environment_radiance);
+#endif
+        s.wi = pick_v(in_sky, wi, s.wi);
+        // Far enough to leave the scene from any point of it.
+        s.toward = pick_v(in_sky, scale(wi, (Float)(4.0f * params->scene_radius)), s.toward);
+        s.radiance = pick_v(in_sky, radiance, s.radiance);
+        s.pdf = pick(in_sky, pdf, s.pdf);
+    }
+#endif
+
+#if PUNCTUAL_LIGHTS
+    const Mask without_extent = active & (kind >= LIGHT_POINT);
+    if (any_lane(without_extent)) {
+        const Vec3 axis = vec3(GATHER(lights, light, direction[0]), GATHER(lights, light, direction[1]),
+                               GATHER(lights, light, direction[2]));
+        const Mask far = kind == LIGHT_DIRECTIONAL;
+        const Vec3 position = vec3(GATHER(lights, light, position[0]), GATHER(lights, light, position[1]),
+                                   GATHER(lights, light, position[2]));
+        const Vec3 near_toward = sub(position, origin);
+        const Vec3 far_toward = scale(axis, (Float)(-4.0f * params->scene_radius));
+        const Vec3 toward = pick_v(far, far_toward, near_toward);
+        const Vec3 wi = normalize3(toward);
+        const Float d2 = dot3(near_toward, near_toward);
+        // KHR_lights_punctual: the window that fades a light out at its range, and the cone's ramp.
+        const Float ratio2 = d2 / (GATHER(lights, light, range) * GATHER(lights, light, range));
+        const Float window = clamp(1.0f - ratio2 * ratio2, (Float)(0.0f), (Float)(1.0f));
+        const Float ramp = clamp((-dot3(axis, wi) - GATHER(lights, light, cos_outer))
+                                     * GATHER(lights, light, spot_scale),
+                                 (Float)(0.0f), (Float)(1.0f));
+        Float fall_off = window / max(d2, 1e-30f);
+        fall_off = pick(kind == LIGHT_SPOT, fall_off * ramp * ramp, fall_off);
+        fall_off = pick(far, (Float)(1.0f), fall_off);
+        const Vec3 intensity = vec3(GATHER(lights, light, intensity[0]), GATHER(lights, light, intensity[1]),
+                                    GATHER(lights, light, intensity[2]));
+        s.toward = pick_v(without_extent, toward, s.toward);
+        s.wi = pick_v(without_extent, wi, s.wi);
+        s.radiance = pick_v(without_extent, scale(intensity, fall_off), s.radiance);
+        s.pdf = pick(without_extent & (far | (d2 > 0.0f)), pmf, s.pdf);
+        s.extended &= !without_extent;
+    }
+#endif
+    return s;
+}

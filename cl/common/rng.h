@@ -1,0 +1,96 @@
+// Random numbers as a function of (seed, pixel, sample, dimension): nothing else, so that an image does
+// not depend on where or when a path is computed.
+#pragma once
+
+#include "lanes.h"
+#include "layout.h"
+
+// Dimensions come in pairs.  A vertex at `depth` owns VERTEX_PAIRS of them from PAIR_VERTEX on.
+#define PAIR_PIXEL 0u
+#define PAIR_LENS 1u
+#define PAIR_VERTEX 2u
+#define VERTEX_PAIRS 5u
+#define PAIR_BSDF 0u
+#define PAIR_LIGHT 1u
+#define PAIR_CHOICE 2u      // which lobe; which light
+#define PAIR_ROULETTE 3u    // whether to go on; which side of the alias slot
+#define PAIR_ENVIRONMENT 4u // which texel; which side of its alias slot
+
+/// Mix all bits of `x`; a bijection.  Wellons, hash-prospector: "lowbias32".
+inline UInt mix_bits(UInt x)
+{
+    x ^= x >> 16;
+    x *= 0x7feb352du;
+    x ^= x >> 15;
+    x *= 0x846ca68bu;
+    x ^= x >> 16;
+    return x;
+}
+
+inline UInt reverse_bits(UInt x)
+{
+    x = (x >> 16) | (x << 16);
+    x = ((x & 0xff00ff00u) >> 8) | ((x & 0x00ff00ffu) << 8);
+    x = ((x & 0xf0f0f0f0u) >> 4) | ((x & 0x0f0f0f0fu) << 4);
+    x = ((x & 0xccccccccu) >> 2) | ((x & 0x33333333u) << 2);
+    x = ((x & 0xaaaaaaaau) >> 1) | ((x & 0x55555555u) << 1);
+    return x;
+}
+
+/// Owen scrambling of a number whose most significant digit is bit 0: a digit is flipped by a hash of
+/// the digits before it.
+///
+/// Laine, Karras: Stratified Sampling for Stochastic Transparency, 2011; Burley: Practical Hash-Based
+/// Owen Scrambling, JCGT 9 (4), 2020; constants by Vegdahl, "Building a Better LK Hash", 2021.
+inline UInt scramble_reversed(UInt x, UInt seed)
+{
+    x ^= x * 0x3d20adeau;
+    x += seed;
+    x *= (seed >> 16) | 1u;
+    x ^= x * 0x05526c56u;
+    x ^= x * 0x53a22864u;
+    return x;
+}
+
+/// Second Sobol' dimension of `index`, most significant digit in bit 0: digit k is the sum modulo 2 of
+/// the index digits j with C(j, k) odd.  By Lucas' theorem the matrix is a tensor power, hence five steps.
+inline UInt sobol_reversed(UInt index)
+{
+    index ^= (index & 0xaaaaaaaau) >> 1;
+    index ^= (index & 0xccccccccu) >> 2;
+    index ^= (index & 0xf0f0f0f0u) >> 4;
+    index ^= (index & 0xff00ff00u) >> 8;
+    index ^= (index & 0xffff0000u) >> 16;
+    return index;
+}
+
+/// Top 24 bits as a number in [0, 1).
+inline Float unit_float(UInt x) { return to_float(x >> 8) * 5.9604645e-8f; }
+
+/// What tells pixels apart; `pixel` counts over the whole film, so a crop has the same numbers.
+inline UInt pixel_seed(UInt pixel, uint seed) { return mix_bits(pixel ^ mix_bits((UInt)(seed ^ 0x9e3779b9u))); }
+
+/// Two uniform 32-bit numbers, stratified over the samples of a pixel if the sampler is Sobol'.
+inline void sample_bits(UInt seed, UInt index, UInt pair, uint sampler, UInt *first, UInt *second)
+{
+    const UInt key = mix_bits(seed + pair * 0x9e3779b9u);
+    if (sampler == SAMPLER_SOBOL) {
+        const UInt shuffled = reverse_bits(scramble_reversed(reverse_bits(index), key));
+        *first = reverse_bits(scramble_reversed(shuffled, mix_bits(key ^ 0x68bc21ebu)));
+        *second = reverse_bits(scramble_reversed(sobol_reversed(shuffled), mix_bits(key ^ 0x02e5be93u)));
+    } else {
+        const UInt number = mix_bits(index + key);
+        *first = mix_bits(number ^ 0x68bc21ebu);
+        *second = mix_bits(number ^ 0x02e5be93u);
+    }
+}
+
+/// Two uniform numbers in [0, 1).
+inline void sample_pair(UInt seed, UInt index, UInt pair, uint sampler, Float *first, Float *second)
+{
+    UInt a;
+    UInt b;
+    sample_bits(seed, index, pair, sampler, &a, &b);
+    *first = unit_float(a);
+    *second = unit_float(b);
+}

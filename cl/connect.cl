@@ -1,0 +1,65 @@
+// Next event estimation, second half: is the light seen?
+
+#include "common/features.h"
+#include "common/lanes.h"
+#include "common/layout.h"
+#include "common/pool.h"
+#include "common/alpha.h"
+#include "common/traverse.h"
+
+/// Trace the shadow rays and add what arrives to their paths.
+///
+/// Also paths that have ended may have a last one.
+///
+/// reads   pool.{shadow, toward, light}; nodes, blocks
+/// writes  pool.radiance (direct), pool.light (cleared); counters.pending_shadow
+kernel void connect_lights(
+    __global const Params *params,
+    __global const BvhNode *nodes,
+    __global const TriangleBlock *blocks,
+    __global float *pool,
+    volatile __global uint *counters ALPHA_PARAMETERS)
+{
+    const uint item = get_global_id(0);
+    if (item >= params->slots / W)
+        return;
+    __global Float *path = pool_at(pool, item);
+    const Vec3 light = get_v(path, PATH_LIGHT_R);
+    const Mask wanted = max3(light) > 0.0f;
+    if (!any_lane(wanted))
+        return;
+    atomic_add(&counters[COUNTER_PENDING_SHADOW], count_lanes(wanted));
+
+    float origin[3][W];
+    float toward[3][W];
+    float lane_light[3][W];
+    for (uint c = 0; c < 3; ++c) {
+        store_lanes(FIELD(path, PATH_SHADOW_X + c), origin[c]);
+        store_lanes(FIELD(path, PATH_TOWARD_X + c), toward[c]);
+        store_lanes(FIELD(path, PATH_LIGHT_R + c), lane_light[c]);
+    }
+    float seen[W];
+    for (uint k = 0; k < W; ++k) {
+        seen[k] = 0.0f;
+        if (!(max(lane_light[0][k], max(lane_light[1][k], lane_light[2][k])) > 0.0f))
+            continue;
+        Ray ray;
+        for (uint c = 0; c < 3; ++c) {
+            ray.origin[c] = origin[c][k];
+            ray.direction[c] = toward[c][k];
+        }
+        ray.t_max = 1.0f;
+        seen[k] = trace_any(nodes, blocks, ray ALPHA_ARGUMENTS) ? 0.0f : 1.0f;
+    }
+    const Vec3 zero = vec3_all((Float)(0.0f));
+    const Vec3 arrives = pick_v(load_lanes(seen) > 0.0f, light, zero);
+    put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), arrives));
+#if AOV_DIRECT
+    // The vertex that sent the ray: the path has moved on unless it ended.
+    const UInt status = get_u(path, PATH_STATUS);
+    const UInt depth = (status & DEPTH_MASK)
+                       - pick_u((status & STATUS_MASK) == STATUS_ALIVE, (UInt)(1u), (UInt)(0u));
+    put_v(path, PATH_DIRECT_R, add(get_v(path, PATH_DIRECT_R), pick_v(depth == 0u, arrives, zero)));
+#endif
+    put_v(path, PATH_LIGHT_R, zero);
+}

@@ -1,0 +1,123 @@
+// The film: sums of whole passes, in the order of the passes.
+
+#include "common/layout.h"
+
+/// Whether the counters say that pass `film_pass + k` is complete and wanted.
+inline int pass_is_complete(__global const Params *params, const volatile __global uint *counters, uint k)
+{
+    const uint pass = counters[COUNTER_FILM_PASS] + k;
+    return k < params->ring && pass < counters[COUNTER_PASS_LIMIT]
+           && counters[COUNTER_FINISHED + (pass & (params->ring - 1u))] == params->pixel_count;
+}
+
+/// Add one value to a compensated sum, so that the millionth sample still counts (Kahan 1965).
+inline void add_compensated(__global FilmSum *sum, uint c, float value)
+{
+    const float y = value - sum->lost[c];
+    const float t = sum->sum[c] + y;
+    sum->lost[c] = (t - sum->sum[c]) - y;
+    sum->sum[c] = t;
+}
+
+inline void add_sample(__global FilmSum *sum, volatile __global uint *counters, float4 sample)
+{
+    if (sample.w <= 0.0f)
+        return;
+    // On bits: a compiler may assume that no float is NaN.
+    uint bad = 0;
+    const uint4 bits = as_uint4(sample);
+    bad |= (bits.x & 0x7f800000u) == 0x7f800000u;
+    bad |= (bits.y & 0x7f800000u) == 0x7f800000u;
+    bad |= (bits.z & 0x7f800000u) == 0x7f800000u;
+    if (bad) {
+        atomic_inc(&counters[COUNTER_REJECTED_SAMPLES]);
+        sample.x = 0.0f;
+        sample.y = 0.0f;
+        sample.z = 0.0f;
+    }
+    sum->count += 1u;
+    add_compensated(sum, 0, sample.x);
+    add_compensated(sum, 1, sample.y);
+    add_compensated(sum, 2, sample.z);
+    // Running variance of the luminance (Welford 1962).
+    const float y = 0.2126f * sample.x + 0.7152f * sample.y + 0.0722f * sample.z;
+    const float delta = y - sum->mean;
+    sum->mean += delta / (float)sum->count;
+    sum->squares += delta * (y - sum->mean);
+}
+
+/// Add every complete pass to the film.  One work item a pixel and plane.
+///
+/// `planes` of `ring * pixel_count` weighted samples each; a weight of 0 means that there is none.
+/// With `partial` set, the samples of the first pass that are there (an interrupted first pass).
+///
+/// reads   samples, counters
+/// writes  film; counters.rejected_samples
+kernel void add_samples(
+    __global const Params *params,
+    __global const float *samples,
+    volatile __global uint *counters,
+    __global FilmSum *film,
+    const uint planes,
+    const uint partial)
+{
+    const uint i = get_global_id(0);
+    if (i >= params->pixel_count * planes)
+        return;
+    const uint plane = i / params->pixel_count;
+    const uint pixel = i - plane * params->pixel_count;
+    for (uint k = 0; k < params->ring; ++k) {
+        if (!partial && !pass_is_complete(params, counters, k))
+            break;
+        const ulong pass = (counters[COUNTER_FILM_PASS] + k) & (params->ring - 1u);
+        const ulong at = ((ulong)plane * params->ring + pass) * params->pixel_count + pixel;
+        add_sample(&film[i], counters, vload4(at, samples));
+        if (partial)
+            break;
+    }
+}
+
+/// Let the window move past the passes that add_samples has added.  One work item.
+///
+/// reads, writes  counters
+kernel void advance_film(__global const Params *params, volatile __global uint *counters)
+{
+    if (get_global_id(0) != 0)
+        return;
+    uint done = 0;
+    while (pass_is_complete(params, counters, done)) // at most params->ring
+        ++done;
+    const uint pass = counters[COUNTER_FILM_PASS];
+    for (uint k = 0; k < done; ++k)
+        counters[COUNTER_FINISHED + ((pass + k) & (params->ring - 1u))] = 0;
+    counters[COUNTER_FILM_PASS] = pass + done;
+
+    // Keep next_pixel small: it would wrap after 2^32 samples.
+    const uint whole = counters[COUNTER_NEXT_PIXEL] / params->pixel_count;
+    counters[COUNTER_NEXT_PIXEL] -= whole * params->pixel_count;
+    counters[COUNTER_NEXT_PASS] += whole;
+
+    for (uint k = 0; k < 3; ++k) {
+        const uint rays = counters[COUNTER_PENDING_CAMERA + k];
+        const uint low = counters[COUNTER_CAMERA_RAYS + 2 * k];
+        counters[COUNTER_CAMERA_RAYS + 2 * k] = low + rays;
+        counters[COUNTER_CAMERA_RAYS + 2 * k + 1] += low + rays < low;
+        counters[COUNTER_PENDING_CAMERA + k] = 0;
+    }
+}
+
+/// Count the paths of the pool by depth (the last bin holds all beyond).  One work item a slot.
+///
+/// reads   pool.status
+/// writes  census
+kernel void count_depths(
+    __global const Params *params, __global const float *pool, volatile __global uint *census, const uint bins)
+{
+    const uint slot = get_global_id(0);
+    if (slot >= params->slots)
+        return;
+    const uint at = (slot / BLOCK * PATH_FIELD_COUNT + PATH_STATUS) * BLOCK + slot % BLOCK;
+    const uint status = as_uint(pool[at]);
+    if ((status & STATUS_MASK) == STATUS_ALIVE)
+        atomic_inc(&census[min(status & DEPTH_MASK, bins - 1u)]);
+}

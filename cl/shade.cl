@@ -1,0 +1,267 @@
+// A vertex of the path: emission found by the ray, next event estimation, the next direction.
+
+#include "common/features.h"
+#include "common/lanes.h"
+#include "common/layout.h"
+#include "common/pool.h"
+#include "common/rng.h"
+#include "common/surface.h"
+#include "common/bsdf.h"
+#include "common/light.h"
+
+#define ANY_LIGHT (AREA_LIGHTS || PUNCTUAL_LIGHTS || ENVIRONMENT)
+#define MAX_SURVIVAL 0.95f
+
+/// Weight of emission that a BSDF-sampled ray found, against sampling the light.
+inline Float emission_weight(__global const Params *params, Mask camera_ray, Float pdf_bsdf, Float pdf_light)
+{
+    Float weight = (Float)(1.0f);
+    if (params->direct_sampling == DIRECT_MIS)
+        weight = power_heuristic(pdf_bsdf, pdf_light);
+    else if (params->direct_sampling == DIRECT_LIGHT)
+        weight = pick(pdf_light > 0.0f, (Float)(0.0f), (Float)(1.0f));
+    return pick(camera_ray, (Float)(1.0f), weight);
+}
+
+#if AOV_FEATURES
+/// Hand in what the first surface looks like: albedo, normal, depth (planes of weighted values).
+inline void store_features(
+    __global const Params *params,
+    __global float *features,
+    Mask mask,
+    Mask hit,
+    UInt sample,
+    UInt pixel,
+    Vec3 albedo,
+    Vec3 ns,
+    Float depth)
+{
+    const Vec3 values[3] = {pick_v(hit, albedo, vec3_all((Float)(0.0f))), ns, vec3(depth, depth, depth)};
+    const Float weights[3] = {(Float)(1.0f), pick(hit, (Float)(1.0f), (Float)(0.0f)),
+                              pick(hit, (Float)(1.0f), (Float)(0.0f))};
+    float lane_mask[W];
+    uint lane_sample[W];
+    uint lane_pixel[W];
+    store_lanes(pick(mask, (Float)(1.0f), (Float)(0.0f)), lane_mask);
+    store_lanes_u(sample, lane_sample);
+    store_lanes_u(pixel, lane_pixel);
+    for (uint plane = 0; plane < 3; ++plane) {
+        float x[W];
+        float y[W];
+        float z[W];
+        float w[W];
+        const Mask known = weights[plane] > 0.0f;
+        const Vec3 value = pick_v(known, values[plane], vec3_all((Float)(0.0f)));
+        store_lanes(value.x, x);
+        store_lanes(value.y, y);
+        store_lanes(value.z, z);
+        store_lanes(weights[plane], w);
+        for (uint k = 0; k < W; ++k)
+            if (lane_mask[k] > 0.0f) {
+                const ulong pass = lane_sample[k] & (params->ring - 1u);
+                const ulong at = (plane * params->ring + pass) * params->pixel_count + lane_pixel[k];
+                vstore4((float4)(x[k], y[k], z[k], w[k]), at, features);
+            }
+    }
+}
+#endif
+
+/// Shade what the rays hit, prepare a shadow ray, and send the paths on or end them.
+///
+/// reads   pool, scene tables
+/// writes  pool.{status, origin, direction, beta, radiance, pdf, shadow, toward, light}; features
+kernel void shade_paths(
+    __global const Params *params,
+    __global const Surface *surfaces,
+#if SMOOTH
+    __global const Normals *normals,
+#endif
+    __global const Material *materials,
+#if TEXTURES
+    __global const Uvs *uvs,
+    __global const TextureInfo *textures,
+    __global const uchar4 *texels,
+    __global const float *srgb_to_linear,
+#endif
+#if ANY_LIGHT
+    __global const Light *lights,
+#endif
+#if ENVIRONMENT == 2
+    __global const EnvironmentCell *environment,
+#endif
+#if AOV_FEATURES
+    __global float *features,
+#endif
+    __global float *pool)
+{
+    const uint item = get_global_id(0);
+    if (item >= params->slots / W)
+        return;
+    __global Float *path = pool_at(pool, item);
+    const UInt status = get_u(path, PATH_STATUS);
+    const Mask alive = (status & STATUS_MASK) == STATUS_ALIVE;
+    if (!any_lane(alive))
+        return;
+
+    const Vec3 zero = vec3_all((Float)(0.0f));
+    const UInt depth = status & DEPTH_MASK;
+    const Mask camera_ray = depth == 0u;
+    const UInt hit_triangle = get_u(path, PATH_HIT_TRIANGLE);
+    const Mask hit = alive & (hit_triangle != NO_HIT);
+    const Vec3 direction = get_v(path, PATH_DIRECTION_X);
+    const Vec3 wo = scale(direction, (Float)(-1.0f));
+    const Float pdf_bsdf = FIELD(path, PATH_PDF);
+    Vec3 beta = get_v(path, PATH_BETA_R);
+    Vec3 emitted = zero;
+
+#if ENVIRONMENT
+    const Mask missed = alive & !hit;
+    if (any_lane(missed)) {
+        Float pdf_light;
+#if ENVIRONMENT == 2
+        const Vec3 radiance = eval_environment(params, environment, direction, &pdf_light);
+#else
+        const Vec3 radiance = eval_environment(params, direction, &pdf_light);
+#endif
+        const Float weight = emission_weight(params, camera_ray, pdf_bsdf, pdf_light);
+        emitted = pick_v(missed, scale(radiance, weight), emitted);
+    }
+#endif
+
+    const UInt triangle = pick_u(hit, hit_triangle, (UInt)(0u));
+    const Float u = FIELD(path, PATH_HIT_U);
+    const Float v = FIELD(path, PATH_HIT_V);
+    const SurfacePoint s = surface_point(triangle, u, v, wo, surfaces
+#if SMOOTH
+                                         , normals
+#endif
+    );
+
+#if AREA_LIGHTS
+    const UInt flags = GATHER_U(materials, s.material, flags);
+    const Mask emits =
+        hit & (s.light != NO_LIGHT) & (s.front | ((flags & MATERIAL_TWO_SIDED_EMISSION) != 0u));
+    if (any_lane(emits)) {
+        const UInt light = pick_u(emits, s.light, (UInt)(0u));
+        Vec3 emission = vec3(GATHER(materials, s.material, emission[0]), GATHER(materials, s.material, emission[1]),
+                             GATHER(materials, s.material, emission[2]));
+#if TEXTURES
+        emission = textured(emits, emission, GATHER_U(materials, s.material, emission_texture), triangle, u, v,
+                            uvs, textures, texels, srgb_to_linear);
+#endif
+        const Float pdf_light =
+            area_light_density(lights, light, FIELD(path, PATH_HIT_T), fabs(dot3(s.ng, wo)), s.area);
+        const Float weight = emission_weight(params, camera_ray, pdf_bsdf, pdf_light);
+        emitted = pick_v(emits, scale(emission, weight), emitted);
+    }
+#endif
+
+    const Vec3 brought = pick_v(alive, mul(beta, emitted), zero);
+    put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), brought));
+#if AOV_DIRECT
+    put_v(path, PATH_DIRECT_R, add(get_v(path, PATH_DIRECT_R), pick_v(depth <= 1u, brought, zero)));
+#endif
+
+    Bsdf b;
+    b.base_color = vec3(GATHER(materials, s.material, base_color[0]), GATHER(materials, s.material, base_color[1]),
+                        GATHER(materials, s.material, base_color[2]));
+#if TEXTURES
+    b.base_color = textured(hit, b.base_color, GATHER_U(materials, s.material, base_color_texture), triangle, u,
+                            v, uvs, textures, texels, srgb_to_linear);
+#endif
+    b.metallic = GATHER(materials, s.material, metallic);
+    b.alpha = max(GATHER(materials, s.material, alpha_ggx), ALPHA_GGX_MIN);
+    b.f0 = GATHER(materials, s.material, f0);
+    b.specular = GATHER(materials, s.material, specular);
+#if TRANSMISSION
+    b.transmission = GATHER(materials, s.material, transmission);
+    const Float ior = GATHER(materials, s.material, ior);
+    b.eta = pick(s.front, ior, 1.0f / ior);
+#endif
+
+    const UInt sample = get_u(path, PATH_SAMPLE);
+    const UInt pixel = get_u(path, PATH_PIXEL);
+#if AOV_FEATURES
+    const Mask first = alive & camera_ray;
+    if (any_lane(first)) {
+        // What a denoiser calls albedo: a metal's reflectance, a dielectric's base colour.
+        store_features(params, features, first, hit, sample, pixel, b.base_color, s.ns, FIELD(path, PATH_HIT_T));
+    }
+#endif
+
+    const Mask goes_on = hit & (depth < params->max_depth);
+    if (!any_lane(goes_on)) {
+        put_u(path, PATH_STATUS, pick_u(alive, STATUS_DONE | depth, status));
+        return;
+    }
+
+    Vec3 tangent;
+    Vec3 bitangent;
+    make_frame(s.ns, &tangent, &bitangent);
+    const Vec3 wo_local = vec3(dot3(tangent, wo), dot3(bitangent, wo), max(dot3(s.ns, wo), (Float)(1e-6f)));
+    const LobeChances chances = lobe_chances(b, wo_local.z);
+
+    // The seed names the pixel by its place on the film; it travels with the path.
+    const UInt seed = get_u(path, PATH_SEED);
+    const UInt pair = PAIR_VERTEX + depth * VERTEX_PAIRS;
+    UInt lobe_bits;
+    UInt light_bits;
+    sample_bits(seed, sample, pair + PAIR_CHOICE, params->sampler, &lobe_bits, &light_bits);
+    Float u_roulette;
+    Float u_alias;
+    sample_pair(seed, sample, pair + PAIR_ROULETTE, params->sampler, &u_roulette, &u_alias);
+
+#if ANY_LIGHT
+    if (params->light_count > 0u) {
+        const Float away = s.offset;
+        const Vec3 above = add_scaled(s.p, s.ng, away);
+        const LightSample light = sample_light(params, lights, surfaces, materials,
+#if TEXTURES
+                                               uvs, textures, texels, srgb_to_linear,
+#endif
+#if ENVIRONMENT == 2
+                                               environment,
+#endif
+                                               goes_on, above, seed, sample, pair, light_bits, u_alias);
+        const Vec3 wi_local = vec3(dot3(tangent, light.wi), dot3(bitangent, light.wi), dot3(s.ns, light.wi));
+        Float pdf;
+        const Vec3 f = eval_bsdf(b, chances, wo_local, wi_local, dot3(s.ng, light.wi), &pdf);
+        Float weight = (Float)(1.0f);
+        if (params->direct_sampling == DIRECT_MIS)
+            weight = pick(light.extended, power_heuristic(light.pdf, pdf), weight);
+        else if (params->direct_sampling == DIRECT_BSDF)
+            weight = pick(light.extended, (Float)(0.0f), weight);
+        const Mask lit = goes_on & (light.pdf > 0.0f);
+        const Vec3 arrives =
+            mul(mul(beta, f), scale(light.radiance, weight / pick(lit, light.pdf, (Float)(1.0f))));
+        put_v(path, PATH_LIGHT_R, pick_v(lit, arrives, zero));
+        // On the far side (glass) the ray starts below; the light stays where it is.
+        const Vec3 origin = ray_origin(s, light.wi);
+        put_v(path, PATH_SHADOW_X, origin);
+        put_v(path, PATH_TOWARD_X, add(light.toward, sub(above, origin)));
+    }
+#endif
+
+    Float u1;
+    Float u2;
+    sample_pair(seed, sample, pair + PAIR_BSDF, params->sampler, &u1, &u2);
+    const Vec3 drawn = sample_bsdf(b, chances, wo_local, unit_float(lobe_bits), u1, u2);
+    const Vec3 wi = normalize3(
+        add_scaled(add_scaled(scale(tangent, drawn.x), bitangent, drawn.y), s.ns, drawn.z));
+    Float pdf;
+    const Vec3 f = eval_bsdf(b, chances, wo_local, drawn, dot3(s.ng, wi), &pdf);
+    beta = mul(beta, scale(f, 1.0f / pick(pdf > 0.0f, pdf, (Float)(1.0f))));
+    Mask survives = goes_on & (pdf > 0.0f) & (max3(beta) > 0.0f);
+
+    const Mask roulette = (depth + 1u) > params->roulette_depth;
+    const Float chance = pick(roulette, min(max3(beta), (Float)(MAX_SURVIVAL)), (Float)(1.0f));
+    survives &= u_roulette < chance;
+    beta = scale(beta, 1.0f / pick(survives, chance, (Float)(1.0f)));
+
+    put_v(path, PATH_BETA_R, beta);
+    put_v(path, PATH_ORIGIN_X, ray_origin(s, wi));
+    put_v(path, PATH_DIRECTION_X, wi);
+    FIELD(path, PATH_PDF) = pdf;
+    const UInt next = pick_u(survives, STATUS_ALIVE | (depth + 1u), STATUS_DONE | depth);
+    put_u(path, PATH_STATUS, pick_u(alive, next, status));
+}

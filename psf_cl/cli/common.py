@@ -1,0 +1,195 @@
+"""What several commands share: options, their types, and how text is shown."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO
+
+from psf_cl.errors import InputError
+from psf_cl.settings import PRESETS, Settings, resolve
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from psf_cl.scene.model import Scene
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line."""
+
+    def __init__(self, **arguments: Any) -> None:
+        super().__init__(allow_abbrev=False, **arguments)
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{message} (see {self.prog} --help)")
+
+
+def size_argument(text: str) -> tuple[int, int]:
+    """Parse ``WxH``; the scene knows the largest size."""
+    numbers = _integers(text, text.lower().split("x"), 2)
+    if numbers is None or min(numbers) < 1:
+        raise argparse.ArgumentTypeError(f"expected WxH in pixels; got {text!r}")
+    return numbers[0], numbers[1]
+
+
+def crop_argument(text: str) -> tuple[int, int, int, int]:
+    """Parse ``X,Y,W,H``; whether it lies in the picture is known later."""
+    numbers = _integers(text, text.split(","), 4)
+    if numbers is None or min(numbers[:2]) < 0 or min(numbers[2:]) < 1:
+        raise argparse.ArgumentTypeError(
+            f"expected X,Y,W,H in pixels, top left first; got {text!r}"
+        )
+    return numbers[0], numbers[1], numbers[2], numbers[3]
+
+
+def aov_argument(text: str) -> frozenset[str]:
+    """Parse a list of AOV names; ``check_aovs`` knows which there are."""
+    return frozenset(part.strip() for part in text.split(","))
+
+
+def positive_integer(text: str) -> int:
+    """Parse an integer above 0 that a 32-bit counter holds."""
+    numbers = _integers(text, [text], 1)
+    if numbers is None or not 1 <= numbers[0] < 1 << 31:
+        raise argparse.ArgumentTypeError(f"expected an integer from 1 to 2147483647; got {text!r}")
+    return numbers[0]
+
+
+def positive_number(text: str) -> float:
+    """Parse a finite number above 0."""
+    number = _number(text)
+    if not (0.0 < number < math.inf):
+        raise argparse.ArgumentTypeError(f"expected a number above 0; got {text!r}")
+    return number
+
+
+def exposure_argument(text: str) -> float:
+    """Parse an exposure in EV."""
+    number = _number(text)
+    if not abs(number) <= 100.0:
+        raise argparse.ArgumentTypeError(f"expected a number from -100 to 100; got {text!r}")
+    return number
+
+
+def setting_argument(text: str) -> tuple[str, str]:
+    """Parse ``key=value``."""
+    key, equals, value = text.partition("=")
+    if not (key and equals):
+        raise argparse.ArgumentTypeError(
+            f"expected key=value; got {text!r} (the scene goes before --set)"
+        )
+    return key.strip(), value.strip()
+
+
+def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add all that decides what is rendered and how: the same for ``render`` and ``plan``."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _settings_help()
+    parser.add_argument("scene", metavar="SCENE", help=".toml, .gltf, .glb, .obj, .ply or .stl")
+    parser.add_argument("--preset", metavar="NAME", help=f"one of: {', '.join(PRESETS)}")
+    parser.add_argument(
+        "--set",
+        dest="settings",
+        metavar="KEY=VALUE",
+        type=setting_argument,
+        nargs="+",
+        action="extend",
+        default=[],
+        help="change settings (listed below)",
+    )
+    parser.add_argument("--seed", metavar="N", help="the same as --set seed=N")
+    parser.add_argument(
+        "--size", metavar="WxH", type=size_argument, help="pixels; the vertical field of view stays"
+    )
+    parser.add_argument(
+        "--crop", metavar="X,Y,W,H", type=crop_argument, help="render only this part"
+    )
+    parser.add_argument("--camera", metavar="NAME", help="a camera of the scene, by its name")
+    parser.add_argument(
+        "--environment", metavar="FILE", help="lat-long image (.exr, .hdr) as the scene's sky"
+    )
+    parser.add_argument(
+        "--aov",
+        metavar="A,B,...",
+        type=aov_argument,
+        default=frozenset(),
+        help="further channels: albedo, normal, depth, direct, indirect, variance, samples",
+    )
+
+
+def load_with_settings(args: argparse.Namespace) -> tuple[Scene, Settings]:
+    """Load the scene and combine the settings.
+
+    Raises:
+        InputError: anything about them is wrong; also the crop and the names of AOVs.
+    """
+    from psf_cl.image import AOVS
+    from psf_cl.scene.load import load_scene
+
+    unknown = sorted(args.aov - AOVS.keys())
+    if unknown:
+        raise InputError(f"--aov: no {unknown[0]!r}; there are: {', '.join(AOVS)}")
+    overrides = dict(args.settings)
+    if args.seed is not None:
+        overrides["seed"] = args.seed
+    scene = load_scene(args.scene, environment=args.environment, camera=args.camera, size=args.size)
+    if args.crop is not None:
+        x, y, width, height = args.crop
+        if x + width > scene.width or y + height > scene.height:
+            raise InputError(
+                f"--crop: {x},{y},{width},{height} leaves the picture, {scene.width}x{scene.height}"
+            )
+    return scene, resolve(scene.render, scene.path, args.preset, overrides)
+
+
+def tell_notes(scene: Scene) -> None:
+    """Print what the reader of the scene assumed or left out."""
+    for note in scene.notes:
+        print(f"note: {note}", file=sys.stderr)
+
+
+def show(*renderables: RenderableType, file: TextIO | None = None) -> None:
+    """Print tables and text to standard output (or ``file``), wide enough when it is no terminal.
+
+    Text is taken as it is: brackets in names are no markup.
+    """
+    from rich.console import Console
+
+    file = file or sys.stdout
+    width = None if file.isatty() else 120
+    console = Console(file=file, width=width, markup=False, highlight=False, emoji=False)
+    # By way of a string, because rich turns a closed pipe into an exit of its own.
+    with console.capture() as capture:
+        for renderable in renderables:
+            console.print(renderable)
+    file.write(capture.get())
+
+
+def _settings_help() -> str:
+    import dataclasses
+
+    lines = ["settings:"]
+    for item in dataclasses.fields(Settings):
+        choices = item.metadata.get("choices")
+        low, high = item.metadata.get("range", (None, None))
+        values = " | ".join(choices) if choices else f"{low} to {high}"
+        lines.append(f"  {item.name:16} {item.metadata['doc']}")
+        lines.append(f"  {'':16} {values}; default {item.default}")
+    return "\n".join(lines)
+
+
+def _integers(text: str, parts: list[str], count: int) -> list[int] | None:
+    """Return ``parts`` as integers, or None if they are not ``count`` plain decimal numbers."""
+    if len(parts) != count or not all(p.strip().isascii() and p.strip().isdigit() for p in parts):
+        return None
+    # Longer numbers are out of every range, and int() itself refuses thousands of digits.
+    return [int(part) for part in parts] if len(text) < 64 else None
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

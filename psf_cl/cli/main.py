@@ -1,0 +1,62 @@
+"""The command ``psf-cl``: arguments in, exit code out."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import os
+import sys
+from collections.abc import Sequence
+
+import psf_cl
+from psf_cl.cli import compare, doctor, plan, render
+from psf_cl.cli.common import Parser
+from psf_cl.errors import DeviceError, InputError
+
+_COMMANDS = (render, plan, doctor, compare)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Returns:
+        0 done, 1 the device or the run failed (or a comparison did), 2 bad input or usage,
+        130 interrupted.
+    """
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # File names may be no text.
+    try:
+        args = _parser().parse_args(argv)
+        code = args.run(args)
+        sys.stdout.flush()
+        return code
+    except InputError as error:
+        return _fail(str(error), 2)
+    except DeviceError as error:
+        return _fail(str(error), 1)
+    except MemoryError:
+        return _fail("out of memory; try a smaller --size or scene", 1)
+    except KeyboardInterrupt:
+        return _fail("interrupted", 130)
+    except BrokenPipeError:
+        # The reader has had enough.  Python flushes once more at exit: let that go nowhere.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = Parser(prog="psf-cl", description="Path tracing on any OpenCL device.")
+    parser.add_argument("--version", action="version", version=f"psf-cl {psf_cl.__version__}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    for command in _COMMANDS:
+        command.add_parser(commands)
+    return parser
+
+
+def _fail(message: str, code: int) -> int:
+    print(f"psf-cl: error: {' '.join(message.split())}", file=sys.stderr)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

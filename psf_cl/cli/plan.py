@@ -1,0 +1,62 @@
+"""``psf-cl plan``: what will run, what is left out and why, and what it takes."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from psf_cl.cli.common import add_scene_arguments, load_with_settings, show, tell_notes
+
+if TYPE_CHECKING:
+    from psf_cl.plan import Plan
+
+
+def add_parser(commands: Any) -> None:
+    """Add the command to the subparsers of ``psf-cl``."""
+    parser = commands.add_parser(
+        "plan", help="show what a render would run and leave out; needs no OpenCL"
+    )
+    add_scene_arguments(parser)
+    parser.add_argument("--json", action="store_true", help="print it as JSON")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the plan of a scene."""
+    from psf_cl.image import json_text
+    from psf_cl.plan import make_plan
+
+    scene, settings = load_with_settings(args)
+    tell_notes(scene)
+    plan = make_plan(scene, settings, outputs=args.aov, device=None, crop=args.crop)
+    if args.json:
+        print(json_text(plan.as_dict(), indent=2))
+    else:
+        _show_plan(plan)
+    return 0
+
+
+def _show_plan(plan: Plan) -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    stages = Table("stage", "runs", "why", "kernels", title="Stages", title_justify="left")
+    buffers = Table("buffer", "stage", "what it holds", title="Buffers", title_justify="left")
+    buffers.add_column("bytes", justify="right")
+    for stage in plan.stages:
+        stages.add_row(
+            stage.name, "yes" if stage.planned else "no", stage.reason, " ".join(stage.kernels)
+        )
+        if stage.planned:
+            for buffer in stage.buffers:
+                buffers.add_row(buffer.name, stage.name, buffer.what, f"{buffer.bytes:,}")
+    buffers.add_section()
+    buffers.add_row("sum", "", f"{plan.total_bytes / 2**20:.1f} MiB", f"{plan.total_bytes:,}")
+
+    features = Table("feature", "value", title="Compiled for", title_justify="left")
+    for name, value in plan.features.items():
+        features.add_row(name, {True: "yes", False: "no"}[value] if value in (0, 1) else str(value))
+    left_out = Table("left out", "why", title="Left out", title_justify="left")
+    for name, reason in plan.left_out:
+        left_out.add_row(name, reason)
+    show(stages, Text(), features, Text(), left_out, Text(), buffers)

@@ -1,0 +1,221 @@
+"""``psf-cl render``: a scene in, an EXR and a PNG out."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import math
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from psf_cl.cli.common import (
+    add_scene_arguments,
+    exposure_argument,
+    load_with_settings,
+    positive_integer,
+    positive_number,
+    tell_notes,
+)
+from psf_cl.cli.progress import ProgressDisplay
+from psf_cl.errors import DeviceError, InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from psf_cl.image import Image
+    from psf_cl.renderer import Progress, Renderer
+    from psf_cl.scene.model import Scene
+
+DEFAULT_SPP = 64
+
+
+def add_parser(commands: Any) -> None:
+    """Add the command to the subparsers of ``psf-cl``."""
+    parser = commands.add_parser("render", help="render a scene to an EXR and a PNG")
+    add_scene_arguments(parser)
+    parser.add_argument(
+        "-o", "--output", metavar="OUT.exr", help="default: the scene's name in this folder"
+    )
+    budget = parser.add_mutually_exclusive_group()
+    budget.add_argument(
+        "--spp", metavar="N", type=positive_integer, help=f"samples a pixel (default {DEFAULT_SPP})"
+    )
+    budget.add_argument(
+        "--seconds", metavar="S", type=positive_number, help="stop after the pass that ends then"
+    )
+    parser.add_argument(
+        "--exposure",
+        metavar="EV",
+        type=exposure_argument,
+        default=0.0,
+        help="brightness of the PNG: 1 doubles it; the EXR stays as it is",
+    )
+    parser.add_argument("--half", action="store_true", help="16-bit floats in the EXR")
+    parser.add_argument(
+        "--device", metavar="TEXT", help="part of its name; default: $PSF_CL_DEVICE, or the best"
+    )
+    parser.add_argument(
+        "--reference", metavar="REF.exr", help="measure the error against this image"
+    )
+    parser.add_argument("--stats", metavar="FILE.json", help="write times, counts and errors")
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Check everything that can be checked, render, write; return 130 if interrupted on the way."""
+    from psf_cl.files import check_writable, write_whole
+    from psf_cl.image import json_text, output_paths, write_exr, write_png
+
+    exr, png = output_paths(args.output or f"{Path(args.scene).stem}.exr")
+    outputs = [exr, png] + ([Path(args.stats)] if args.stats else [])
+    _check_distinct(outputs, [args.scene, args.reference, args.environment])
+    for path in outputs:
+        check_writable(path)
+    scene, settings = load_with_settings(args)
+    reference = _reference(args, scene) if args.reference else None
+    if not args.quiet:
+        tell_notes(scene)
+
+    try:
+        from psf_cl.device.device import open_device
+        from psf_cl.renderer import Renderer
+    except ImportError as error:
+        raise DeviceError(f"no OpenCL ({error}); psf-cl doctor says what to do") from error
+
+    renderer = Renderer(
+        scene, settings, device=open_device(args.device), outputs=args.aov, crop=args.crop
+    )
+    with contextlib.closing(renderer):
+        curve = ErrorCurve(reference)
+        with stop_on_interrupt() as interrupted, ProgressDisplay(args.quiet) as display:
+
+            def on_progress(progress: Progress) -> bool:
+                display.update(progress)
+                curve.follow(renderer, progress)
+                return not interrupted()
+
+            spp = None if args.seconds else args.spp or DEFAULT_SPP
+            renderer.render(spp=spp, seconds=args.seconds, progress=on_progress)
+            stopped = interrupted()
+        stats = renderer.stats()
+        if stopped and not stats["spp"]:
+            raise KeyboardInterrupt
+        image = renderer.image()
+    stats["scene"] = scene.path
+    if reference is not None:
+        curve.add(stats["render_seconds"], stats["spp"], image.rgb)
+        stats["error"] = curve.points
+    image.stats = stats
+
+    write_exr(exr, image, args.half)
+    write_png(png, image, args.exposure)
+    if args.stats:
+        write_whole(args.stats, (json_text(stats, indent=2) + "\n").encode())
+    if not args.quiet:
+        print(_summary(exr, image))
+    if stopped:
+        print("psf-cl: interrupted; what was rendered is written", file=sys.stderr)
+    return 130 if stopped else 0
+
+
+class ErrorCurve:
+    """Error over render time: after the first pass, at 1, 2, 4, ... seconds, and at the end.
+
+    Attributes:
+        points: seconds, spp and metrics, in order of time.
+    """
+
+    def __init__(self, reference: np.ndarray | None) -> None:
+        self.points: list[dict[str, float]] = []
+        self._reference = reference
+        self._next_seconds = 0.0
+
+    def follow(self, renderer: Renderer, progress: Progress) -> None:
+        """Take a snapshot if it is time for one; render time does not count it."""
+        if self._reference is None or progress.passes < 1 or progress.seconds < self._next_seconds:
+            return
+        with renderer.outside_time():
+            self.add(progress.seconds, progress.passes, renderer.snapshot(("rgb",)).rgb)
+        self._next_seconds = 1.0
+        while self._next_seconds <= progress.seconds:
+            self._next_seconds *= 2.0
+
+    def add(self, seconds: float, spp: int, rgb: np.ndarray) -> None:
+        """Append a point; in place of the last if no sample has been added since."""
+        from psf_cl.measure.errors import compare
+
+        if self.points and self.points[-1]["spp"] == spp:
+            self.points.pop()
+        metrics = compare(rgb, self._reference).as_dict()
+        self.points.append({"seconds": seconds, "spp": spp, **metrics})
+
+
+@contextlib.contextmanager
+def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
+    """Give a function that says whether Ctrl-C was pressed; the second Ctrl-C interrupts at once.
+
+    Outside the main thread, where Python delivers no signals, Ctrl-C keeps its meaning.
+    """
+    pressed = False
+
+    def on_signal(number: int, frame: object) -> None:
+        nonlocal pressed
+        pressed = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    before = signal.signal(signal.SIGINT, on_signal)
+    try:
+        yield lambda: pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _reference(args: argparse.Namespace, scene: Scene) -> np.ndarray:
+    """Read the reference and return the part to be rendered, checked for being one."""
+    import numpy as np
+
+    from psf_cl.image import Image, read_exr
+    from psf_cl.measure.errors import matching_part, mean_luminance
+
+    x, y, width, height = args.crop or (0, 0, scene.width, scene.height)
+    wanted = Image(
+        {"rgb": np.empty((height, width, 3), np.float32)}, {}, x, y, scene.width, scene.height
+    )
+    rgb = matching_part(read_exr(args.reference), wanted, args.reference).rgb
+    try:
+        mean_luminance(rgb)
+    except InputError as error:
+        raise InputError(f"{args.reference}: {error}") from error
+    return rgb
+
+
+def _check_distinct(outputs: list[Path], inputs: list[str | None]) -> None:
+    taken = {os.path.realpath(path): path for path in inputs if path is not None}
+    for path in outputs:
+        real = os.path.realpath(path)
+        if real in taken:
+            raise InputError(f"{path}: cannot write: it is another input or output of this render")
+        taken[real] = str(path)
+
+
+def _summary(path: Path, image: Image) -> str:
+    stats = image.stats
+    spp, seconds = stats["spp"], stats["render_seconds"]
+    samples = image.width * image.height * spp
+    rate = samples / seconds / 1e6 if seconds > 0.0 else math.inf
+    text = f"{path}: {spp} spp in {seconds:.2f} s, {rate:.2f} Msamples/s"
+    if stats.get("error"):
+        last = stats["error"][-1]
+        text += f", relMSE {last['relmse']:.4g}, trimmed {last['relmse_trimmed']:.4g}"
+        if last["nonfinite"]:
+            text += f", {last['nonfinite']} pixels not finite"
+    return text

@@ -1,0 +1,247 @@
+"""Device: one OpenCL device with its queue and memory; the only copies and the only wait."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyopencl as cl
+
+from psf_cl.device.selftest import run_self_test
+from psf_cl.errors import DeviceError, InputError
+from psf_cl.traits import DeviceTraits
+
+if TYPE_CHECKING:
+    from psf_cl.device.program import Program
+
+DEVICE_VARIABLE = "PSF_CL_DEVICE"
+
+
+@dataclass(frozen=True)
+class Buffer:
+    """Device memory with the type of its items.
+
+    Attributes:
+        dtype: NumPy type of one item; a structured type for records.
+        count: items, at least 1 (OpenCL has no empty buffers).
+    """
+
+    name: str
+    dtype: np.dtype[Any]
+    count: int
+    memory: cl.Buffer
+
+    @property
+    def bytes(self) -> int:
+        return self.count * self.dtype.itemsize
+
+    def release(self) -> None:
+        self.memory.release()
+
+
+class Device:
+    """A context and an in-order queue on one OpenCL device.
+
+    Nothing here is global: several of them live side by side.
+
+    Attributes:
+        traits: what the kernels are specialised to.
+        profiling: whether every launch keeps its event (``Program.bind``).
+    """
+
+    def __init__(self, device: cl.Device, traits: DeviceTraits, profiling: bool = False) -> None:
+        self.cl_device = device
+        self.traits = traits
+        self.profiling = profiling
+        self.context = cl.Context([device])
+        flags = cl.command_queue_properties.PROFILING_ENABLE if profiling else 0
+        self.queue = cl.CommandQueue(self.context, properties=flags)
+        self.allocated_bytes = 0
+        self.peak_bytes = 0
+        self.compile_seconds = 0.0
+        self.programs: dict[tuple[Any, ...], Program] = {}
+        self.events: list[tuple[str, int, cl.Event]] = []
+
+    @property
+    def name(self) -> str:
+        return f"{self.cl_device.platform.name}: {self.cl_device.name}".strip()
+
+    @property
+    def driver(self) -> str:
+        return f"{self.cl_device.platform.version} / {self.cl_device.driver_version}".strip()
+
+    def allocate(self, name: str, dtype: Any, count: int) -> Buffer:
+        """Return a zero-filled buffer of ``count`` (at least 1) items.
+
+        Raises:
+            DeviceError: the device has no room for it.
+        """
+        dtype = np.dtype(dtype)
+        count = max(int(count), 1)
+        size = count * dtype.itemsize
+        limit = self.cl_device.max_mem_alloc_size
+        if size > limit:
+            raise DeviceError(
+                f"{name} needs {size / 2**20:.0f} MiB; {self.name} allows {limit / 2**20:.0f} MiB in one buffer"
+            )
+        try:
+            memory = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, size)
+            # A pattern of one byte divides every size.
+            cl.enqueue_fill_buffer(self.queue, memory, np.uint8(0), 0, size)
+        except (cl.MemoryError, cl.RuntimeError, cl.LogicError) as error:
+            raise DeviceError(f"{name}: {size / 2**20:.0f} MiB refused by {self.name}: {error}") from error
+        self.allocated_bytes += size
+        self.peak_bytes = max(self.peak_bytes, self.allocated_bytes)
+        return Buffer(name, dtype, count, memory)
+
+    def upload(self, name: str, array: np.ndarray) -> Buffer:
+        """Return a buffer that holds a copy of ``array`` (flattened)."""
+        array = np.ascontiguousarray(array)
+        buffer = self.allocate(name, array.dtype, array.size)
+        self.write(buffer, array)
+        return buffer
+
+    def write(self, buffer: Buffer, array: np.ndarray, offset: int = 0) -> None:
+        """Copy ``array`` into ``buffer`` from item ``offset`` on; returns when it is copied."""
+        array = np.ascontiguousarray(array)
+        if array.dtype != buffer.dtype or offset + array.size > buffer.count:
+            raise ValueError(
+                f"{buffer.name}: {array.size} items of {array.dtype} at {offset} do not fit "
+                f"{buffer.count} of {buffer.dtype}"
+            )
+        if array.size:
+            cl.enqueue_copy(
+                self.queue, buffer.memory, array, dst_offset=offset * buffer.dtype.itemsize
+            )
+
+    def read(self, buffer: Buffer, count: int | None = None, offset: int = 0) -> np.ndarray:
+        """Return items of ``buffer`` after all queued work is done."""
+        count = buffer.count - offset if count is None else count
+        if offset + count > buffer.count:
+            raise ValueError(f"{buffer.name}: {count} items at {offset} of {buffer.count}")
+        array = np.empty(count, buffer.dtype)
+        if count:
+            cl.enqueue_copy(
+                self.queue, array, buffer.memory, src_offset=offset * buffer.dtype.itemsize
+            )
+        return array
+
+    def copy(self, source: Buffer, target: Buffer, count: int) -> None:
+        """Enqueue a copy of the first ``count`` items."""
+        size = count * source.dtype.itemsize
+        if size > min(source.bytes, target.bytes):
+            raise ValueError(f"{source.name} to {target.name}: {count} items are too many")
+        if size:
+            cl.enqueue_copy(self.queue, target.memory, source.memory, byte_count=size)
+
+    def fill(self, buffer: Buffer, byte: int = 0) -> None:
+        """Enqueue setting every byte of ``buffer``."""
+        cl.enqueue_fill_buffer(self.queue, buffer.memory, np.uint8(byte), 0, buffer.bytes)
+
+    def release(self, *buffers: Buffer) -> None:
+        """Give buffers back; using one afterwards is an error."""
+        for buffer in buffers:
+            self.allocated_bytes -= buffer.bytes
+            buffer.release()
+
+    def mark(self) -> cl.Event:
+        """Return an event that is done when all work queued so far is; starts that work."""
+        event = cl.enqueue_marker(self.queue)
+        self.queue.flush()
+        return event
+
+    def wait(self, event: cl.Event | None = None) -> None:
+        """Wait for ``event``, or for everything queued.  The one place where the host waits.
+
+        Raises:
+            DeviceError: the device failed while it worked.
+        """
+        try:
+            if event is None:
+                self.queue.finish()
+            else:
+                event.wait()
+        except cl.Error as error:
+            raise DeviceError(f"{self.name} failed: {error}") from error
+
+    def stage_seconds(self) -> dict[str, tuple[int, float, int]]:
+        """Return launches, seconds and items per kernel since the last call (profiling only)."""
+        self.wait()
+        totals: dict[str, tuple[int, float, int]] = {}
+        for name, items, event in self.events:
+            launches, seconds, done = totals.get(name, (0, 0.0, 0))
+            spent = (event.profile.end - event.profile.start) * 1e-9
+            totals[name] = (launches + 1, seconds + spent, done + items)
+        self.events.clear()
+        return totals
+
+    def timed_compile(self, work: Any) -> Any:
+        """Call ``work()`` and add its time to ``compile_seconds``."""
+        start = time.perf_counter()
+        result = work()
+        self.compile_seconds += time.perf_counter() - start
+        return result
+
+
+def list_devices() -> list[cl.Device]:
+    """Return every OpenCL device, in the loader's order.
+
+    Raises:
+        DeviceError: there is no OpenCL platform.
+    """
+    try:
+        platforms = cl.get_platforms()
+    except cl.LogicError as error:
+        raise DeviceError("no OpenCL platform found; psf-cl doctor says how to get one") from error
+    devices = []
+    for platform in platforms:
+        try:
+            devices += platform.get_devices()
+        except cl.Error:  # A platform without a device reports an error; others may have one.
+            continue
+    return devices
+
+
+def open_device(
+    text: str | None = None, traits: DeviceTraits | None = None, profiling: bool = False
+) -> Device:
+    """Open the device that ``text`` names, else ``$PSF_CL_DEVICE``, else the best that works.
+
+    A device is taken only after the self-test kernel gave the right answer on it.  Without a name,
+    GPUs come first, then accelerators, then CPUs, each in the loader's order.
+
+    Args:
+        text: part of "platform: device", case-insensitive.
+        traits: overrides what is known of the kind of device (tests of lane widths).
+
+    Raises:
+        InputError: no device has that name.
+        DeviceError: none works.
+    """
+    source = "--device"
+    if text is None:
+        text, source = os.environ.get(DEVICE_VARIABLE) or None, DEVICE_VARIABLE
+    devices = list_devices()
+    names = [f"{device.platform.name}: {device.name}".strip() for device in devices]
+    if text is not None:
+        chosen = [d for d, name in zip(devices, names, strict=True) if text.lower() in name.lower()]
+        if not chosen:
+            raise InputError(f"{source}: no device matches {text!r}; there are: {'; '.join(names) or 'none'}")
+        devices = chosen
+    rank = {cl.device_type.GPU: 0, cl.device_type.ACCELERATOR: 1}
+    devices.sort(key=lambda device: rank.get(device.type, 2))
+    failures = []
+    for device in devices:
+        reason = run_self_test(device)
+        if reason is None:
+            kind = "cpu" if device.type & cl.device_type.CPU else "gpu"
+            return Device(device, traits or DeviceTraits.of_kind(kind), profiling)
+        failures.append(f"{device.platform.name}: {reason}")
+    raise DeviceError(
+        "no OpenCL device passes the self-test"
+        + (f" ({'; '.join(failures)})" if failures else "")
+        + "; psf-cl doctor says what to do"
+    )

@@ -1,0 +1,367 @@
+"""Records shared with the device: listed once here; ``cl/common/layout.h`` is written from them.
+
+Every field is a 4-byte word or an array of them, so offsets agree everywhere; a record's size is a
+multiple of 16 bytes.  ``tools/make_layout.py`` writes the header; a test asks the device.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Field:
+    """One field: C name, scalar type, array extents, and what it means (with its unit)."""
+
+    name: str
+    type: str
+    shape: tuple[int, ...]
+    meaning: str
+
+
+@dataclass(frozen=True)
+class Record:
+    """One struct."""
+
+    name: str
+    meaning: str
+    fields: tuple[Field, ...]
+
+    @property
+    def dtype(self) -> np.dtype:
+        scalars = {"float": "<f4", "uint": "<u4", "int": "<i4"}
+        return np.dtype(
+            [(item.name, scalars[item.type], item.shape) for item in self.fields],
+            metadata={"c_name": self.name},
+        )
+
+    def c_text(self) -> str:
+        lines = [f"/// {self.meaning}", "typedef struct {"]
+        for item in self.fields:
+            extents = "".join(f"[{extent}]" for extent in item.shape)
+            lines.append(f"    {item.type} {item.name}{extents}; // {item.meaning}")
+        return "\n".join([*lines, f"}} {self.name};"])
+
+
+def _fields(text: str) -> tuple[Field, ...]:
+    """Parse lines of ``type name[extents] - meaning``."""
+    fields = []
+    for line in text.strip().splitlines():
+        declaration, meaning = line.strip().split(" - ", 1)
+        kind, name = declaration.split()
+        name, *extents = name.replace("]", "").split("[")
+        fields.append(Field(name, kind, tuple(int(extent) for extent in extents), meaning))
+    return tuple(fields)
+
+
+PARAMS = Record(
+    "Params",
+    "Everything that is the same for all paths of a render.",
+    _fields("""
+    float camera_origin[3] - world, m
+    float lens_radius - m
+    float camera_right[3] - unit, world
+    float focus_distance - m
+    float camera_up[3] - unit, world
+    float film_scale_x - tangent of half the horizontal field of view
+    float camera_forward[3] - unit, world
+    float film_scale_y - tangent of half the vertical field of view
+    uint width - pixels of the whole film
+    uint height - pixels of the whole film
+    uint crop_x - first column that is rendered
+    uint crop_y - first row that is rendered
+    uint crop_width - columns that are rendered
+    uint pixel_count - pixels that are rendered
+    uint ring - passes that may be in flight
+    uint slots - paths of the pool
+    uint seed - start of every random sequence
+    uint max_depth - bounces
+    uint roulette_depth - bounces before roulette
+    uint light_count - entries of the light table
+    uint triangle_count - entries of the triangle tables
+    uint material_count - entries of the material table
+    uint environment_width - texels
+    uint environment_height - texels
+    float environment_radiance[3] - constant sky, or factor of the image
+    float environment_pmf - chance that the light table picks the environment
+    float environment_rotation[9] - world to local, row-major
+    float scene_radius - m, of the bounding sphere
+    uint direct_sampling - DIRECT_MIS, DIRECT_LIGHT or DIRECT_BSDF
+    uint sampler - SAMPLER_SOBOL or SAMPLER_RANDOM
+    """),
+)
+
+BVH_NODE = Record(
+    "BvhNode",
+    "Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.",
+    _fields("""
+    float bounds[6][8] - x low, x high, y low, y high, z low, z high of each child; an empty one is inverted
+    uint child[8] - node index, or LEAF_BIT | block index
+    uint unused[8] - fills the cache line
+    """),
+)
+
+TRIANGLE_BLOCK = Record(
+    "TriangleBlock",
+    "A leaf: up to four triangles side by side; an unused one is all NaN.",
+    _fields("""
+    float v[9][4] - vertex * 3 + axis; world, m
+    uint id[4] - triangle index, ALPHA_BIT set if its alpha must be looked up
+    """),
+)
+
+SURFACE = Record(
+    "Surface",
+    "A triangle as shading needs it.",
+    _fields("""
+    float p0[3] - first vertex; world, m
+    uint material - index into the materials
+    float e1[3] - second vertex minus first
+    uint light - index into the light table, NO_LIGHT if it does not emit
+    float e2[3] - third vertex minus first
+    float flip - -1 if the instance's transform mirrors the mesh, else 1
+    """),
+)
+
+NORMALS = Record(
+    "Normals",
+    "Shading normals of a triangle's corners; all zero if it is flat.",
+    _fields("""
+    float n0[3] - unit, world
+    float pad0 - fills the word
+    float n1[3] - unit, world
+    float pad1 - fills the word
+    float n2[3] - unit, world
+    float pad2 - fills the word
+    """),
+)
+
+UVS = Record(
+    "Uvs",
+    "Texture coordinates of a triangle's corners.",
+    _fields("""
+    float uv0[2] - first corner
+    float uv1[2] - second corner
+    float uv2[2] - third corner
+    float pad[2] - fills the record
+    """),
+)
+
+MATERIAL = Record(
+    "Material",
+    "Parameters of the one BSDF.",
+    _fields("""
+    float base_color[3] - linear Rec.709
+    float metallic - 0 dielectric, 1 metal
+    float emission[3] - radiance
+    float alpha_ggx - roughness squared
+    float f0 - dielectric reflectance at normal incidence times specular
+    float specular - F90 of the dielectric; 0 for pure diffuse
+    float ior - index of refraction
+    float transmission - 0 opaque, 1 glass
+    uint base_color_texture - index, NO_TEXTURE for none
+    uint emission_texture - index, NO_TEXTURE for none
+    uint flags - MATERIAL_TWO_SIDED_EMISSION, MATERIAL_ALPHA_MASK
+    float alpha_cutoff - of the mask, divided by the alpha factor
+    """),
+)
+
+TEXTURE = Record(
+    "TextureInfo",
+    "Where a texture's texels are.",
+    _fields("""
+    uint offset - first texel
+    uint width - texels
+    uint height - texels
+    uint flags - TEXTURE_* bits: wrap of u and v, nearest, sRGB
+    """),
+)
+
+LIGHT = Record(
+    "Light",
+    "An emitter of the light table.",
+    _fields("""
+    uint kind - LIGHT_TRIANGLE, LIGHT_ENVIRONMENT, LIGHT_POINT, LIGHT_SPOT or LIGHT_DIRECTIONAL
+    uint triangle - index, for LIGHT_TRIANGLE
+    float pmf - chance to be picked
+    float keep - alias table: chance that the slot keeps its own index
+    float position[3] - world, m
+    uint other - alias table: the index otherwise
+    float direction[3] - unit, the way the light travels
+    float range - m, inf for none
+    float intensity[3] - candela or lux
+    float cos_outer - of the cone
+    float spot_scale - 1 / (cos inner - cos outer), floored
+    float pad[3] - fills the record
+    """),
+)
+
+ENVIRONMENT_CELL = Record(
+    "EnvironmentCell",
+    "A texel of the environment: radiance and its slot of the alias table.",
+    _fields("""
+    float radiance[3] - before the factor
+    float pmf - chance of the texel
+    float keep - alias table
+    uint other - alias table
+    float pad[2] - fills the record
+    """),
+)
+
+FILM_SUM = Record(
+    "FilmSum",
+    "All samples of one pixel of one plane.",
+    _fields("""
+    float sum[3] - of the values
+    uint count - samples
+    float lost[3] - what the sums lost by rounding
+    float mean - running mean of the luminance
+    float squares - sum of squared deviations from it
+    float pad[3] - fills the record
+    """),
+)
+
+RECORDS = (
+    PARAMS,
+    BVH_NODE,
+    TRIANGLE_BLOCK,
+    SURFACE,
+    NORMALS,
+    UVS,
+    MATERIAL,
+    TEXTURE,
+    LIGHT,
+    ENVIRONMENT_CELL,
+    FILM_SUM,
+)
+
+#: Words of a path's state, in the order in which they lie in a block of the pool.
+PATH_FIELDS = (
+    ("origin_x", "ray origin, world, m"),
+    ("origin_y", ""),
+    ("origin_z", ""),
+    ("direction_x", "unit ray direction"),
+    ("direction_y", ""),
+    ("direction_z", ""),
+    ("hit_triangle", "uint; NO_HIT if the ray left the scene"),
+    ("hit_t", "m"),
+    ("hit_u", "barycentric coordinate of the second corner"),
+    ("hit_v", "barycentric coordinate of the third corner"),
+    ("beta_r", "throughput"),
+    ("beta_g", ""),
+    ("beta_b", ""),
+    ("radiance_r", "gathered so far"),
+    ("radiance_g", ""),
+    ("radiance_b", ""),
+    ("direct_r", "of that, what light reflected at most once brought"),
+    ("direct_g", ""),
+    ("direct_b", ""),
+    ("pdf", "solid-angle density of the ray's direction; 0 if it could not be light-sampled"),
+    ("status", "uint; STATUS_* bits and the depth"),
+    ("sample", "uint; index of the sample, which is its pass"),
+    ("pixel", "uint; position in the order of pixels"),
+    ("seed", "uint; of the pixel, by its place on the film"),
+    ("shadow_x", "shadow ray origin, world, m"),
+    ("shadow_y", ""),
+    ("shadow_z", ""),
+    ("toward_x", "from there to the light, not normalised: the light is at t = 1"),
+    ("toward_y", ""),
+    ("toward_z", ""),
+    ("light_r", "radiance that arrives if nothing is in between, times beta; all 0: no ray"),
+    ("light_g", ""),
+    ("light_b", ""),
+)
+
+#: Words of the counters, all uint.
+COUNTERS = (
+    ("next_pixel", "next pixel to be started, counted from the first pixel of next_pass"),
+    ("next_pass", "pass that next_pixel 0 belongs to"),
+    ("film_pass", "passes that the film holds"),
+    ("pass_limit", "first pass that must not be started; set by the host"),
+    ("camera_rays", "low word"),
+    ("camera_rays_high", "high word"),
+    ("bounce_rays", "low word"),
+    ("bounce_rays_high", "high word"),
+    ("shadow_rays", "low word"),
+    ("shadow_rays_high", "high word"),
+    ("rejected_samples", "samples that were not finite or negative"),
+    ("pending_camera", "rays since the last film launch"),
+    ("pending_bounce", ""),
+    ("pending_shadow", ""),
+    ("stack_overflows", "traversal stacks that were full"),
+    ("finished", "first of the ring: samples done of each pass in flight"),
+)
+
+CONSTANTS = (
+    ("LEAF_BIT", 0x80000000, "child[] is a block of triangles"),
+    ("ALPHA_BIT", 0x80000000, "id[] needs its alpha looked up"),
+    ("NO_HIT", 0xFFFFFFFF, ""),
+    ("NO_LIGHT", 0xFFFFFFFF, ""),
+    ("NO_TEXTURE", 0xFFFFFFFF, ""),
+    ("MATERIAL_TWO_SIDED_EMISSION", 1, ""),
+    ("MATERIAL_ALPHA_MASK", 2, ""),
+    ("TEXTURE_CLAMP_U", 1, ""),
+    ("TEXTURE_MIRROR_U", 2, ""),
+    ("TEXTURE_CLAMP_V", 4, ""),
+    ("TEXTURE_MIRROR_V", 8, ""),
+    ("TEXTURE_NEAREST", 16, ""),
+    ("TEXTURE_SRGB", 32, ""),
+    ("LIGHT_TRIANGLE", 0, ""),
+    ("LIGHT_ENVIRONMENT", 1, ""),
+    ("LIGHT_POINT", 2, ""),
+    ("LIGHT_SPOT", 3, ""),
+    ("LIGHT_DIRECTIONAL", 4, ""),
+    ("DIRECT_MIS", 0, ""),
+    ("DIRECT_LIGHT", 1, ""),
+    ("DIRECT_BSDF", 2, ""),
+    ("SAMPLER_SOBOL", 0, ""),
+    ("SAMPLER_RANDOM", 1, ""),
+    ("STATUS_IDLE", 0, "the slot has no path yet"),
+    ("STATUS_WAITING", 0x40000000, "it holds a sample whose pass may not start yet"),
+    ("STATUS_ALIVE", 0x80000000, "it traces a ray"),
+    ("STATUS_DONE", 0xC0000000, "the path ended, the film does not have it yet"),
+    ("STATUS_MASK", 0xC0000000, ""),
+    ("DEPTH_MASK", 0x3FFFFFFF, "bounces so far"),
+)
+
+_FRAME = """\
+// Written by tools/make_layout.py from psf_cl/device/layout.py: change that, then run it.
+#pragma once
+
+{constants}
+
+{paths}
+#define PATH_FIELD_COUNT {path_count}u
+
+{counters}
+
+{records}
+"""
+
+
+def header() -> str:
+    """Return the text of ``cl/common/layout.h``."""
+
+    def define(name: str, value: int, meaning: str) -> str:
+        shown = f"0x{value:08X}u" if value > 0xFFFF else f"{value}u"
+        return f"#define {name} {shown}" + (f" // {meaning}" if meaning else "")
+
+    return _FRAME.format(
+        constants="\n".join(define(*constant) for constant in CONSTANTS),
+        paths="\n".join(
+            define(f"PATH_{name.upper()}", index, meaning)
+            for index, (name, meaning) in enumerate(PATH_FIELDS)
+        ),
+        path_count=len(PATH_FIELDS),
+        counters="\n".join(
+            define(f"COUNTER_{name.upper()}", index, meaning)
+            for index, (name, meaning) in enumerate(COUNTERS)
+        ),
+        records="\n\n".join(record.c_text() for record in RECORDS),
+    )
+
+
+COUNTER_INDEX = {name: index for index, (name, _) in enumerate(COUNTERS)}
+CONSTANT = {name: value for name, value, _ in CONSTANTS}

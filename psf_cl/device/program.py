@@ -1,0 +1,195 @@
+"""Sources to programs to launches: includes expanded here, arguments bound by name and checked."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+from psf_cl.device.device import Buffer, Device
+from psf_cl.device.sources import kernel_folder
+from psf_cl.errors import DeviceError
+
+_INCLUDE = re.compile(r'^\s*#\s*include\s+"([^"]+)"\s*$')
+_SCALARS: dict[str, type[np.generic]] = {
+    "float": np.float32,
+    "int": np.int32,
+    "uint": np.uint32,
+    "ulong": np.uint64,
+    "uchar": np.uint8,
+    "ushort": np.uint16,
+}
+_BUILD_OPTIONS = ("-cl-std=CL1.2", "-cl-kernel-arg-info")
+
+
+def assemble(file: str, folder: Path | None = None) -> str:
+    """Return the text of ``file`` with every ``#include "x"`` expanded once.
+
+    Drivers cache by source text, so the text has to hold all that it depends on; ``#line`` at each
+    seam makes build errors name the real file and line.
+    """
+    folder = (folder or kernel_folder()).resolve()
+    seen: set[Path] = set()
+
+    def expand(path: Path) -> list[str]:
+        seen.add(path)
+        inside = path.is_relative_to(folder)
+        shown = f"cl/{path.relative_to(folder).as_posix()}" if inside else path.name
+        lines = [f'#line 1 "{shown}"']
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+            match = _INCLUDE.match(line)
+            if match is None:
+                # Includes are expanded once anyway, and compilers warn of the pragma in a main file.
+                lines.append("" if line.strip() == "#pragma once" else line)
+                continue
+            target = (path.parent / match.group(1)).resolve()
+            if not target.is_file():
+                raise DeviceError(f"{shown}:{number}: no file {match.group(1)}")
+            if target not in seen:
+                lines += expand(target)
+                lines.append(f'#line {number + 1} "{shown}"')
+        return lines
+
+    return "\n".join(expand((folder / file).resolve())) + "\n"
+
+
+class Program:
+    """One built source file.
+
+    Attributes:
+        file: the ``.cl`` file.
+        defines: every macro that it was built with.
+    """
+
+    def __init__(self, device: Device, file: str, defines: dict[str, int], folder: Path | None) -> None:
+        self.device = device
+        self.file = file
+        self.defines = defines
+        options = [*_BUILD_OPTIONS, *(f"-D{name}={value}" for name, value in sorted(defines.items()))]
+        source = assemble(file, folder)
+        try:
+            self.program = device.timed_compile(
+                lambda: cl.Program(device.context, source).build(options=options)
+            )
+        except cl.RuntimeError as error:
+            raise DeviceError(f"{file} does not build on {device.name}: {error}") from error
+
+    def bind(self, kernel: str, **arguments: Buffer | int | float | np.generic) -> Launch:
+        """Return a launch of ``kernel`` with its arguments set by name.
+
+        Raises:
+            TypeError: an argument is missing, unknown, or of another type than the kernel's.
+        """
+        return Launch(self, kernel, arguments)
+
+    def bind_planned(self, kernel: str, buffers: Mapping[str, Buffer]) -> Launch:
+        """Return a launch of ``kernel`` whose arguments are the ``buffers`` of the same names.
+
+        Raises:
+            TypeError: the kernel wants something that is not among them.
+        """
+        names = argument_names(cl.Kernel(self.program, kernel))
+        return self.bind(kernel, **{name: buffers[name] for name in names if name in buffers})
+
+
+def argument_names(kernel: cl.Kernel) -> list[str]:
+    """Return the names of a kernel's arguments in their order."""
+    return [
+        kernel.get_arg_info(index, cl.kernel_arg_info.NAME) for index in range(kernel.num_args)
+    ]
+
+
+def load_program(
+    device: Device, file: str, defines: dict[str, int] | None = None, folder: Path | None = None
+) -> Program:
+    """Return ``file`` built with ``defines``; a device builds each combination once.
+
+    The lane width and the block of the pool are defined for every program.
+    """
+    traits = device.traits
+    values = {"W": traits.lanes, "BLOCK": traits.block} | {
+        name: int(value) for name, value in (defines or {}).items()
+    }
+    key = (file, folder, tuple(sorted(values.items())))
+    if key not in device.programs:
+        device.programs[key] = Program(device, file, values, folder)
+    return device.programs[key]
+
+
+class Launch:
+    """A kernel with its arguments; calling it only enqueues.
+
+    ``launch(items)`` runs ``items`` work items, rounded up to whole groups: kernels bound-check.
+    """
+
+    def __init__(
+        self, program: Program, name: str, arguments: dict[str, Buffer | int | float | np.generic]
+    ) -> None:
+        self.device = program.device
+        self.name = name
+        self.label = f"{program.file}: {name}"
+        try:
+            # A kernel object holds its arguments, so each binding has its own.
+            self.kernel = cl.Kernel(program.program, name)
+        except cl.LogicError as error:
+            raise TypeError(f"{self.label}: no such kernel") from error
+        self.parameters: dict[str, tuple[int, str, bool]] = {}
+        for index in range(self.kernel.num_args):
+            info = cl.kernel_arg_info
+            pointer = (
+                self.kernel.get_arg_info(index, info.ADDRESS_QUALIFIER)
+                != cl.kernel_arg_address_qualifier.PRIVATE
+            )
+            spelled = self.kernel.get_arg_info(index, info.TYPE_NAME).replace(" ", "")
+            self.parameters[self.kernel.get_arg_info(index, info.NAME)] = (index, spelled, pointer)
+        missing = self.parameters.keys() - arguments.keys()
+        if missing:
+            raise TypeError(f"{self.label}: missing {', '.join(sorted(missing))}")
+        # The queue does not keep what a kernel points to: the launch does.
+        self.held: dict[str, Any] = {}
+        self.set(**arguments)
+
+    def set(self, **arguments: Buffer | int | float | np.generic) -> Launch:
+        """Change arguments; returns the launch."""
+        for name, value in arguments.items():
+            if name not in self.parameters:
+                raise TypeError(f"{self.label}: no argument {name}; has {', '.join(self.parameters)}")
+            index, spelled, pointer = self.parameters[name]
+            self.kernel.set_arg(index, self._converted(name, value, spelled, pointer))
+            self.held[name] = value
+        return self
+
+    def _converted(self, name: str, value: Any, spelled: str, pointer: bool) -> Any:
+        if pointer:
+            if not isinstance(value, Buffer):
+                raise TypeError(f"{self.label}: {name} is {spelled}, got {type(value).__name__}")
+            wanted = _type_name(value.dtype)
+            base = spelled.rstrip("*")
+            # float16* and the like are views of floats.
+            if wanted != base and wanted != re.sub(r"\d+$", "", base) and base not in ("void", "uchar"):
+                raise TypeError(f"{self.label}: {name} is {spelled}, got a buffer of {wanted}")
+            return value.memory
+        if spelled not in _SCALARS:
+            raise TypeError(f"{self.label}: {name} has the unsupported type {spelled}")
+        return _SCALARS[spelled](value)
+
+    def __call__(self, items: int, group: int | None = None) -> None:
+        """Enqueue ``items`` work items (0 does nothing)."""
+        if items <= 0:
+            return
+        group = group or self.device.traits.group
+        padded = -(-items // group) * group
+        event = cl.enqueue_nd_range_kernel(self.device.queue, self.kernel, (padded,), (group,))
+        if self.device.profiling:
+            self.device.events.append((self.name, items, event))
+
+
+def _type_name(dtype: np.dtype[Any]) -> str:
+    if dtype.names is not None:
+        return str((dtype.metadata or {}).get("c_name", "void"))
+    names = {np.dtype(scalar): name for name, scalar in _SCALARS.items()}
+    return names.get(dtype, str(dtype))

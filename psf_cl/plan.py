@@ -1,0 +1,259 @@
+"""Scene and settings to a Plan: what is compiled, what runs, which buffers exist, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from psf_cl.device import layout
+from psf_cl.errors import InputError
+from psf_cl.scene.model import Scene
+from psf_cl.settings import Settings
+from psf_cl.stages import camera, connect, film, intersect, shade
+from psf_cl.stages.spec import BufferSpec, Context, Feature, StageSpec
+from psf_cl.tables import emits, has_environment, is_cut_out
+from psf_cl.traits import DeviceTraits
+
+#: Names that ``outputs`` may hold besides the image itself.
+AOVS = ("albedo", "normal", "depth", "direct", "indirect", "variance", "samples")
+
+#: Bytes that the passes in flight may take before the ring is made shorter.
+RING_BYTES = 1 << 28
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a render consists of.
+
+    Attributes:
+        features: compile-time switches with their values and reasons.
+        stages: those that run, in their order.
+        left_out: (name, why) of what this scene and these settings do not need.
+        scene_buffers: tables of the scene.
+        crop: (x, y, width, height) of what is rendered.
+    """
+
+    features: dict[str, Feature]
+    stages: tuple[StageSpec, ...]
+    left_out: tuple[tuple[str, str], ...]
+    scene_buffers: tuple[BufferSpec, ...]
+    outputs: frozenset[str]
+    crop: tuple[int, int, int, int]
+    ring: int
+    traits: DeviceTraits
+
+    @property
+    def pixel_count(self) -> int:
+        return self.crop[2] * self.crop[3]
+
+    @property
+    def buffers(self) -> tuple[BufferSpec, ...]:
+        return self.scene_buffers + tuple(buffer for stage in self.stages for buffer in stage.buffers)
+
+    @property
+    def total_bytes(self) -> int:
+        return sum(buffer.bytes for buffer in self.buffers)
+
+    def defines(self, stage: StageSpec) -> dict[str, int]:
+        """Return the macros to build ``stage`` with: what it does not depend on is 0."""
+        return {
+            name: feature.value if name in stage.flags else 0 for name, feature in self.features.items()
+        }
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the plan as plain JSON values."""
+        return {
+            "features": {
+                name: {"value": feature.value, "reason": feature.reason}
+                for name, feature in self.features.items()
+            },
+            "stages": [
+                {
+                    "name": stage.name,
+                    "reason": stage.reason,
+                    "sources": list(stage.sources),
+                    "kernels": list(stage.kernels),
+                    "buffers": [
+                        {"name": b.name, "bytes": b.bytes, "what": b.what} for b in stage.buffers
+                    ],
+                }
+                for stage in self.stages
+            ],
+            "left_out": [{"name": name, "reason": reason} for name, reason in self.left_out],
+            "scene_buffers": [
+                {"name": b.name, "bytes": b.bytes, "what": b.what} for b in self.scene_buffers
+            ],
+            "outputs": sorted(self.outputs),
+            "crop": list(self.crop),
+            "total_bytes": self.total_bytes,
+        }
+
+
+def make_plan(
+    scene: Scene,
+    settings: Settings,
+    outputs: Iterable[str] = (),
+    traits: DeviceTraits | None = None,
+    crop: tuple[int, int, int, int] | None = None,
+) -> Plan:
+    """Derive what a render needs; works without OpenCL.
+
+    Args:
+        outputs: AOVs to deliver besides the image.
+        traits: of the device; a CPU if not given.
+        crop: (x, y, width, height) in pixels; the whole film if not given.
+
+    Raises:
+        InputError: an unknown AOV, or a crop outside the film.
+    """
+    traits = traits or DeviceTraits.of_kind("cpu")
+    outputs = frozenset(outputs)
+    unknown = sorted(outputs - set(AOVS))
+    if unknown:
+        raise InputError(f"--aov: unknown {', '.join(unknown)}; known: {', '.join(AOVS)}")
+    crop = crop or (0, 0, scene.width, scene.height)
+    x, y, width, height = crop
+    if width < 1 or height < 1 or x < 0 or y < 0 or x + width > scene.width or y + height > scene.height:
+        raise InputError(
+            f"--crop: {x},{y},{width},{height} is not inside the film of {scene.width}x{scene.height}"
+        )
+
+    features = _features(scene, outputs)
+    pixel_count = width * height
+    used = {shape.material for shape in scene.shapes}
+    triangles = sum(len(shape.mesh.triangles) for shape in scene.shapes)
+    image = scene.environment.image
+    context = Context(
+        features,
+        traits,
+        pixel_count,
+        _ring(pixel_count, traits, features),
+        outputs=outputs,
+        triangle_count=triangles,
+        material_count=len(scene.materials),
+        texture_count=len(scene.textures),
+        texel_count=sum(texture.pixels.size // 4 for texture in scene.textures),
+        environment_count=image.shape[0] * image.shape[1]
+        if image is not None and features["ENVIRONMENT"].value == 2
+        else 0,
+    )
+    stages, left_out = [], []
+    for module in (camera, intersect, shade, connect, film):
+        stage = module.plan(context)
+        if stage is None:
+            left_out.append((module.__name__.rsplit(".", 1)[-1], "the scene has no light"))
+        else:
+            stages.append(stage)
+    left_out += [(name.lower(), feature.reason) for name, feature in features.items() if not feature.value]
+    if len(used) < len(scene.materials):
+        left_out.append(("materials", f"{len(scene.materials) - len(used)} are on no shape"))
+    return Plan(
+        features,
+        tuple(stages),
+        tuple(left_out),
+        _scene_buffers(context, scene, used),
+        outputs,
+        crop,
+        context.ring,
+        traits,
+    )
+
+
+def _ring(pixel_count: int, traits: DeviceTraits, features: dict[str, Feature]) -> int:
+    """Return how many passes may be in flight, a power of two.
+
+    Long paths of an early pass must not stop the slots: a few times the pool in samples goes on
+    behind them, at least two passes, as far as memory goes.
+    """
+    sample_bytes = 16 * (1 + features["AOV_DIRECT"].value + 3 * features["AOV_FEATURES"].value)
+    wanted = max(8 * traits.slots / pixel_count, 2)
+    affordable = max(RING_BYTES / (sample_bytes * pixel_count), 2)
+    ring = 2
+    while ring < wanted and ring * 2 <= affordable:
+        ring *= 2
+    return ring
+
+
+def _features(scene: Scene, outputs: frozenset[str]) -> dict[str, Feature]:
+    materials = [scene.materials[i] for i in sorted({shape.material for shape in scene.shapes})]
+    camera_lens = bool(scene.cameras) and scene.cameras[scene.camera].lens_radius > 0.0
+    lights = [light for light in scene.lights if max(light.intensity) > 0.0]
+    sky = has_environment(scene.environment)
+    image = scene.environment.image is not None
+
+    def switch(value: bool, yes: str, no: str) -> Feature:
+        return Feature(int(value), yes if value else no)
+
+    textured = any(
+        m.base_color_texture >= 0 or (emits(m) and m.emission_texture >= 0) for m in materials
+    )
+    feature_aovs = outputs & {"albedo", "normal", "depth"}
+    return {
+        "TEXTURES": switch(textured, "a material has a texture", "no material has a texture"),
+        "ALPHA": switch(
+            any(is_cut_out(m) for m in materials), "a material is cut out by its alpha", "no material is cut out"
+        ),
+        "SMOOTH": switch(
+            any(shape.mesh.normals is not None for shape in scene.shapes),
+            "a mesh has shading normals",
+            "no mesh has shading normals",
+        ),
+        "TRANSMISSION": switch(
+            any(m.transmission > 0.0 and m.metallic < 1.0 for m in materials),
+            "a material lets light through",
+            "no material lets light through",
+        ),
+        "AREA_LIGHTS": switch(any(emits(m) for m in materials), "a shape emits", "no shape emits"),
+        "PUNCTUAL_LIGHTS": switch(
+            bool(lights), f"{len(lights)} lights without extent", "no point, spot or directional light"
+        ),
+        "ENVIRONMENT": Feature(
+            (2 if image else 1) if sky else 0,
+            ("an environment image" if image else "a constant sky") if sky else "the environment is black",
+        ),
+        "LENS": switch(camera_lens, "the camera has a lens", "the camera is a pinhole"),
+        "AOV_DIRECT": switch(
+            bool(outputs & {"direct", "indirect"}), "direct or indirect was asked for", "neither direct nor indirect was asked for"
+        ),
+        "AOV_FEATURES": switch(
+            bool(feature_aovs), f"{', '.join(sorted(feature_aovs))} asked for", "no albedo, normal or depth was asked for"
+        ),
+    }
+
+
+def _scene_buffers(context: Context, scene: Scene, used: set[int]) -> tuple[BufferSpec, ...]:
+    triangles = context.triangle_count
+    emitting = sum(
+        len(shape.mesh.triangles) for shape in scene.shapes if emits(scene.materials[shape.material])
+    )
+    punctual = sum(max(light.intensity) > 0.0 for light in scene.lights)
+    lights = emitting + punctual + bool(context.features["ENVIRONMENT"].value)
+    float32, uint8 = np.dtype(np.float32), np.dtype(np.uint8)
+    buffers = [
+        BufferSpec("params", layout.PARAMS.dtype, 1, "camera and settings"),
+        BufferSpec("blocks", layout.TRIANGLE_BLOCK.dtype, -(-triangles // 2), "leaves (estimate)"),
+        BufferSpec("nodes", layout.BVH_NODE.dtype, -(-triangles // 6), "inner nodes (estimate)"),
+        BufferSpec("surfaces", layout.SURFACE.dtype, triangles, "triangles for shading"),
+        BufferSpec("materials", layout.MATERIAL.dtype, context.material_count, "materials"),
+    ]
+    if context.on("SMOOTH"):
+        buffers.append(BufferSpec("normals", layout.NORMALS.dtype, triangles, "shading normals"))
+    if context.on("TEXTURES") or context.on("ALPHA"):
+        buffers += [
+            BufferSpec("uvs", layout.UVS.dtype, triangles, "texture coordinates"),
+            BufferSpec("textures", layout.TEXTURE.dtype, context.texture_count, "where textures lie"),
+            BufferSpec("texels", uint8, 4 * context.texel_count, "texels of all textures"),
+            BufferSpec("srgb_to_linear", float32, 256, "decoding table"),
+        ]
+    if lights:
+        buffers.append(BufferSpec("lights", layout.LIGHT.dtype, lights, "light table"))
+    if context.features["ENVIRONMENT"].value == 2:
+        buffers.append(
+            BufferSpec(
+                "environment", layout.ENVIRONMENT_CELL.dtype, context.environment_count, "environment image"
+            )
+        )
+    return tuple(buffers)

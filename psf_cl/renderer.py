@@ -1,0 +1,409 @@
+"""Load, plan, schedule, return: the one place that knows the order of the stages."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psf_cl import tables
+from psf_cl.device import layout
+from psf_cl.device.bvh import Bvh, build_bvh
+from psf_cl.device.device import Buffer, Device, open_device
+from psf_cl.device.program import Launch, load_program
+from psf_cl.errors import InputError
+from psf_cl.image import Image
+from psf_cl.plan import Plan, make_plan
+from psf_cl.scene.load import load_scene
+from psf_cl.scene.model import Scene
+from psf_cl.scheduler import Frame, Progress, Scheduler
+from psf_cl.settings import Settings, resolve
+from psf_cl.stages import film
+
+#: Depths that the occupancy statistics tell apart; the last takes all beyond.
+OCCUPANCY_BINS = 32
+
+
+class Renderer:
+    """One scene on one device, rendered pass by pass.
+
+    Args:
+        outputs: AOVs to deliver besides the image (``psf_cl.plan.AOVS``).
+        crop: (x, y, width, height) in pixels, or None for the whole film.
+
+    Raises:
+        InputError: the settings or outputs do not fit the scene.
+        DeviceError: the device failed or has no room.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        settings: Settings | None = None,
+        device: Device | None = None,
+        outputs: Iterable[str] = (),
+        crop: tuple[int, int, int, int] | None = None,
+    ) -> None:
+        start = time.perf_counter()
+        self.scene = scene
+        self.settings = settings or resolve(scene.render, scene.path)
+        if not scene.cameras:
+            raise InputError(f"{scene.path}: no camera")
+        self.device = device or open_device()
+        self.plan: Plan = make_plan(scene, self.settings, outputs, self.device.traits, crop)
+        self.excluded_seconds = 0.0
+        self.buffers: dict[str, Buffer] = {}
+        self._allocate()
+        geometry = self._upload_scene()
+        load_end = time.perf_counter()
+        self.bvh: Bvh = self._build_bvh(geometry)
+        build_end = time.perf_counter()
+        self._bind()
+        self.scheduler = Scheduler(
+            Frame(self._bounce, self._film, self._counters, self._limit), self.plan.pixel_count
+        )
+        self._warm_up()
+        self.load_seconds = load_end - start
+        self.build_seconds = build_end - load_end
+        self.compile_seconds = time.perf_counter() - build_end
+
+    # What happens each bounce, in its order.
+
+    def _bounce(self) -> None:
+        items = self.plan.traits.slots // self.plan.traits.lanes
+        for launch in self.bounce_launches:
+            launch(items)
+
+    def _film(self) -> None:
+        for launch, planes in self.film_launches:
+            launch(planes * self.plan.pixel_count, film.GROUP)
+        self.advance(1)
+
+    def _counters(self) -> np.ndarray:
+        return self.device.read(self.buffers["counters"])
+
+    def _limit(self, passes: int) -> None:
+        value = np.array([passes], np.uint32)
+        self.device.write(self.buffers["counters"], value, layout.COUNTER_INDEX["pass_limit"])
+
+    # Rendering.
+
+    def step(self) -> None:
+        """Add one pass: one sample for every pixel."""
+        self.render(spp=self.scheduler.passes + 1)
+
+    def render(
+        self,
+        spp: int | None = None,
+        seconds: float | None = None,
+        progress: Callable[[Progress], bool | None] | None = None,
+    ) -> bool:
+        """Add passes until there are ``spp``, or until ``seconds`` have been spent on rendering.
+
+        Returns:
+            False if ``progress`` stopped it by returning False.
+        """
+        if (spp is None) == (seconds is None):
+            raise InputError("give either spp or seconds")
+        return self.scheduler.run(spp, seconds, progress)
+
+    @contextlib.contextmanager
+    def outside_time(self) -> Iterator[None]:
+        """Do something in between that is not rendering: its time is not counted."""
+        clock = self.scheduler.clock
+        running = clock.started is not None
+        self.device.wait()
+        clock.stop()
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.excluded_seconds += time.perf_counter() - begin
+            if running:
+                clock.start()
+
+    def snapshot(self, names: Iterable[str] = ("rgb",)) -> Image:
+        """Return the image as it is now, with only the AOVs in ``names``."""
+        return self._image(set(names))
+
+    def image(self) -> Image:
+        """Return the image with every planned AOV and the statistics."""
+        return self._image({"rgb"} | self.plan.outputs)
+
+    def _image(self, names: set[str]) -> Image:
+        x, y, width, height = self.plan.crop
+        partial = self.scheduler.passes == 0
+        order = self._order()
+        sums: dict[str, np.ndarray] = {}
+        for ring, name, planes in film.PLANES:
+            if name not in self.buffers:
+                continue
+            if partial:
+                # Not one pass is complete: what is there of the first is all there is.
+                self.device.fill(self.buffers[name])
+                self._add_launch(ring, name, planes, partial=True)(planes * self.plan.pixel_count, film.GROUP)
+            sums[name] = self.device.read(self.buffers[name]).reshape(planes, -1)
+            if partial:
+                self.device.fill(self.buffers[name])
+
+        def mean(plane: np.ndarray) -> np.ndarray:
+            count = np.maximum(plane["count"], 1).astype(np.float32)
+            # The part that rounding took from the sum is known: it goes back before the division.
+            values = (plane["sum"] - plane["lost"]) / count[:, None]
+            image = np.zeros((width * height, 3), np.float32)
+            image[order] = values
+            return image.reshape(height, width, 3)
+
+        aovs: dict[str, np.ndarray] = {}
+        main = sums["film"][0]
+        aovs["rgb"] = mean(main)
+        if "film_direct" in sums:
+            aovs["direct"] = mean(sums["film_direct"][0])
+            aovs["indirect"] = aovs["rgb"] - aovs["direct"]
+        if "film_features" in sums:
+            aovs["albedo"], aovs["normal"], depth = (mean(plane) for plane in sums["film_features"])
+            aovs["depth"] = depth[..., :1]
+
+        def scalar(values: np.ndarray) -> np.ndarray:
+            image = np.zeros(width * height, np.float32)
+            image[order] = values
+            return image.reshape(height, width, 1)
+
+        aovs["samples"] = scalar(main["count"])
+        count = main["count"].astype(np.float64)
+        variance = main["squares"] / np.maximum(count - 1, 1) / np.maximum(count, 1)
+        aovs["variance"] = scalar(np.where(count > 1, variance, 0.0))
+        return Image(
+            aovs={name: aovs[name] for name in aovs if name in names},
+            stats=self.stats(),
+            x=x,
+            y=y,
+            full_width=self.scene.width,
+            full_height=self.scene.height,
+        )
+
+    def stats(self) -> dict[str, Any]:
+        """Return what ``--stats`` writes, without errors against a reference."""
+        counters = self._counters()
+
+        def wide(name: str) -> int:
+            at = layout.COUNTER_INDEX[name]
+            return int(counters[at]) + (int(counters[at + 1]) << 32)
+
+        names = ("camera", "bounce", "shadow")
+        # Rays since the last film launch have not been carried over yet.
+        rays = {
+            name: wide(f"{name}_rays") + int(counters[layout.COUNTER_INDEX[f"pending_{name}"]])
+            for name in names
+        }
+        stages = [
+            {"name": name, "launches": launches, "seconds": seconds, "items": items}
+            for name, (launches, seconds, items) in self._stage_totals().items()
+        ]
+        return {
+            "scene": self.scene.path,
+            "spp": self.scheduler.passes,
+            "passes": self.scheduler.passes,
+            "render_seconds": self.scheduler.clock.now(),
+            "build_seconds": self.build_seconds,
+            "compile_seconds": self.compile_seconds,
+            "load_seconds": self.load_seconds,
+            "rays": rays,
+            "device": self.device.name,
+            "driver": self.device.driver,
+            "peak_device_bytes": self.device.peak_bytes,
+            "stages": stages,
+            "occupancy": self._occupancy(),
+            "counters": {
+                "rejected_samples": int(counters[layout.COUNTER_INDEX["rejected_samples"]]),
+                "dropped_triangles": self.bvh.dropped,
+            },
+            "bvh": {
+                "nodes": self.bvh.node_count,
+                "blocks": self.bvh.block_count,
+                "depth": self.bvh.depth,
+            },
+            "settings": {
+                name: getattr(self.settings, name) for name in self.settings.__dataclass_fields__
+            },
+            "seed": self.settings.seed,
+        }
+
+    def close(self) -> None:
+        """Give the device memory back."""
+        self.device.wait()
+        self.device.release(*self.buffers.values())
+        self.buffers.clear()
+
+    # Set-up.
+
+    def _allocate(self) -> None:
+        for stage in self.plan.stages:
+            for spec in stage.buffers:
+                self.buffers[spec.name] = self.device.allocate(spec.name, spec.dtype, spec.count)
+        self.device.write(self.buffers["pixel_order"], tables.pixel_order(*self.plan.crop))
+
+    def _order(self) -> np.ndarray:
+        """Return the place in the crop of each entry of the pixel order."""
+        x, y, width, _ = self.plan.crop
+        order = tables.pixel_order(*self.plan.crop)
+        return ((order >> 16) - y) * width + ((order & 0xFFFF) - x)
+
+    def _upload_scene(self) -> tables.Geometry:
+        scene, planned = self.scene, {spec.name for spec in self.plan.scene_buffers}
+        geometry = tables.flatten(scene)
+        lights, environment_pmf = tables.light_table(scene, geometry, self.settings.light_sampling)
+        textures, texels = tables.texture_tables(scene.textures if "textures" in planned else ())
+        uvs = geometry.uvs if geometry.uvs is not None else np.zeros(geometry.count, layout.UVS.dtype)
+        contents = {
+            "params": lambda: self._params(geometry, len(lights), environment_pmf),
+            "surfaces": lambda: geometry.surfaces,
+            "materials": lambda: tables.material_table(scene.materials),
+            "normals": lambda: geometry.normals,
+            "uvs": lambda: uvs,
+            "textures": lambda: textures,
+            "texels": lambda: texels.reshape(-1),
+            "srgb_to_linear": tables.srgb_to_linear,
+            "lights": lambda: lights if len(lights) else np.zeros(1, layout.LIGHT.dtype),
+            "environment": lambda: tables.environment_cells(scene.environment),
+        }
+        for name, content in contents.items():
+            if name in planned:
+                self.buffers[name] = self.device.upload(name, content())
+        return geometry
+
+    def _params(self, geometry: tables.Geometry, light_count: int, environment_pmf: float) -> np.ndarray:
+        scene, settings = self.scene, self.settings
+        x, y, width, _ = self.plan.crop
+        params = np.zeros(1, layout.PARAMS.dtype)
+        values: dict[str, Any] = tables.camera_values(scene.cameras[scene.camera], scene.width, scene.height)
+        image = scene.environment.image
+        values |= {
+            "width": scene.width,
+            "height": scene.height,
+            "crop_x": x,
+            "crop_y": y,
+            "crop_width": width,
+            "pixel_count": self.plan.pixel_count,
+            "ring": self.plan.ring,
+            "slots": self.plan.traits.slots,
+            "seed": settings.seed,
+            "max_depth": settings.max_depth,
+            "roulette_depth": settings.roulette_depth if settings.termination == "roulette" else 0xFFFFFFFF,
+            "light_count": light_count,
+            "triangle_count": geometry.count,
+            "material_count": len(scene.materials),
+            "environment_width": 1 if image is None else image.shape[1],
+            "environment_height": 1 if image is None else image.shape[0],
+            "environment_radiance": scene.environment.radiance,
+            "environment_pmf": environment_pmf,
+            "environment_rotation": np.asarray(scene.environment.rotation).T.reshape(9),
+            "scene_radius": self._scene_radius(geometry),
+            "direct_sampling": layout.CONSTANT[f"DIRECT_{settings.direct_sampling.upper()}"],
+            "sampler": layout.CONSTANT[f"SAMPLER_{settings.sampler.upper()}"],
+        }
+        for name, value in values.items():
+            params[0][name] = value
+        return params
+
+    def _scene_radius(self, geometry: tables.Geometry) -> float:
+        """Return the radius of a sphere around the geometry."""
+        return max(geometry.radius, float(np.finfo(np.float32).tiny))
+
+    def _build_bvh(self, geometry: tables.Geometry) -> Bvh:
+        device = self.device
+        positions = device.upload("positions", geometry.positions.reshape(-1))
+        flags = None
+        if self.plan.features["ALPHA"].value:
+            cut_out = np.array([tables.is_cut_out(m) for m in self.scene.materials], np.uint32)
+            flags = device.upload("alpha_flags", cut_out[geometry.surfaces["material"]])
+        bvh = build_bvh(device, positions, geometry.count, flags)
+        device.release(positions, *([flags] if flags is not None else []))
+        self.buffers |= {"nodes": bvh.nodes, "blocks": bvh.blocks}
+        return bvh
+
+    def _bind(self) -> None:
+        self.bounce_launches: list[Launch] = []
+        for stage in self.plan.stages:
+            if stage.name == "film":
+                self.film_program = load_program(self.device, stage.source, self.plan.defines(stage))
+                continue
+            defines = self.plan.defines(stage) | {"STACK_SIZE": self.bvh.stack_size}
+            program = load_program(self.device, stage.source, defines)
+            self.bounce_launches += [program.bind_planned(name, self.buffers) for name in stage.kernels]
+        self.film_launches = [
+            (self._add_launch(ring, name, planes, partial=False), planes)
+            for ring, name, planes in film.PLANES
+            if name in self.buffers
+        ]
+        self.advance = self.film_program.bind_planned("advance_film", self.buffers)
+
+    def _add_launch(self, ring: str, name: str, planes: int, partial: bool) -> Launch:
+        return self.film_program.bind(
+            "add_samples",
+            params=self.buffers["params"],
+            samples=self.buffers[ring],
+            counters=self.buffers["counters"],
+            film=self.buffers[name],
+            planes=planes,
+            partial=int(partial),
+        )
+
+    def _warm_up(self) -> None:
+        """Launch everything once while no pass may start: PoCL generates code at the first launch."""
+        self._limit(0)
+        self._bounce()
+        self._film()
+        self.device.wait()
+        self.device.events.clear()
+
+    # Statistics.
+
+    def _occupancy(self) -> list[int]:
+        """Return the living paths of the pool by their bounces so far."""
+        census = self.device.allocate("census", np.uint32, OCCUPANCY_BINS)
+        self.film_program.bind(
+            "count_depths",
+            params=self.buffers["params"],
+            pool=self.buffers["pool"],
+            census=census,
+            bins=OCCUPANCY_BINS,
+        )(self.plan.traits.slots, film.GROUP)
+        counts = [int(count) for count in self.device.read(census)]
+        self.device.release(census)
+        return counts
+
+    def _stage_totals(self) -> dict[str, tuple[int, float, int]]:
+        return self.device.stage_seconds() if self.device.profiling else {}
+
+
+def render(
+    scene: Scene | str | Path,
+    preset: str | None = None,
+    *,
+    spp: int | None = None,
+    seconds: float | None = None,
+    device: Device | None = None,
+    outputs: Iterable[str] = (),
+    **settings: Any,
+) -> Image:
+    """Render a scene, or the scene in a file, and return its image.
+
+    Args:
+        spp, seconds: the budget; 64 samples a pixel if neither is given.
+        settings: any field of ``Settings``.
+    """
+    if not isinstance(scene, Scene):
+        scene = load_scene(Path(scene))
+    if spp is None and seconds is None:
+        spp = 64
+    renderer = Renderer(scene, resolve(scene.render, scene.path, preset, settings), device, outputs)
+    try:
+        renderer.render(spp, seconds)
+        return renderer.image()
+    finally:
+        renderer.close()

@@ -1,0 +1,1 @@
+"""Files to Scene: NumPy only, never OpenCL."""

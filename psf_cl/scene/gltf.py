@@ -1,0 +1,581 @@
+"""Read a glTF 2.0 file into a Scene: what its default scene shows at rest.
+
+Appearance that the renderer lacks is left out and said in the scene's notes; what cannot be read
+with certainty is an error.
+
+Source: Khronos Group, "glTF 2.0 Specification", and the extensions listed in ``SUPPORTED``.
+"""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from psf_cl.errors import InputError
+from psf_cl.scene.gltf_file import (
+    FLOAT,
+    QUANTISED_OR_FLOAT,
+    UNSIGNED,
+    GltfFile,
+    Item,
+    MissingData,
+    open_gltf,
+)
+from psf_cl.scene.model import Camera, Light, Material, Mesh, Scene, Shape, Texture
+from psf_cl.scene.texture import decode_pixels
+from psf_cl.scene.transform import rotation_quaternion, without_scale
+
+# A file may list these as required; anything else required is refused.
+SUPPORTED = (
+    "EXT_texture_webp",
+    "KHR_lights_punctual",
+    "KHR_materials_emissive_strength",
+    "KHR_materials_ior",
+    "KHR_materials_specular",
+    "KHR_materials_transmission",
+    "KHR_materials_unlit",
+    "KHR_mesh_quantization",
+)
+# Known so well that lit surfaces are an acceptable substitute, but not followed.
+_SUBSTITUTED = ("KHR_materials_unlit",)
+
+# Nodes times primitives can be far more than the file's size suggests.
+MAX_SHAPES = 1 << 20
+MAX_WIDTH = 4096
+
+_WRAP = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
+_FILTER = {9728: "nearest", 9729: "linear"}
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+
+
+def load_gltf(path: Path) -> Scene:
+    """Return what the default scene of a .gltf or .glb shows; an empty one has no shapes.
+
+    The materials are those in use, by first use.  Width and height follow the first camera's aspect
+    ratio; the environment is black.
+
+    Raises:
+        InputError: the file or a file it names cannot be read, is malformed where it is used, or
+            requires an unknown extension.
+    """
+    gltf = open_gltf(path)
+    _check_version(gltf.root.item("asset"))
+    _check_required(gltf.root)
+    return _Reader(gltf).scene(str(path))
+
+
+@dataclass
+class _Reader:
+    """The parts of the scene collected so far; materials and meshes are read at first use."""
+
+    gltf: GltfFile
+    notes: Counter[str] = field(default_factory=Counter)
+    extensions: set[str] = field(default_factory=set)
+    cameras: list[Camera] = field(default_factory=list)
+    lights: list[Light] = field(default_factory=list)
+    shapes: list[Shape] = field(default_factory=list)
+    materials: dict[int | None, int] = field(default_factory=dict)
+    material_list: list[Material] = field(default_factory=list)
+    textures: dict[tuple[int, tuple[str, str], str], int] = field(default_factory=dict)
+    texture_list: list[Texture] = field(default_factory=list)
+    pixels: dict[int, np.ndarray] = field(default_factory=dict)
+    meshes: dict[int, list[tuple[Mesh, int | None]]] = field(default_factory=dict)
+    aspect: float | None = None
+
+    def scene(self, path: str) -> Scene:
+        """Read all nodes of the default scene."""
+        root = self.gltf.root
+        self.extensions.update(root.texts("extensionsUsed"))
+        nodes = [root.element("nodes", i) for i in range(root.length("nodes"))]
+        children = [self.gltf.indices(node, "children", "nodes") for node in nodes]
+        order, parents = _order_nodes(nodes, children)
+        world = _world_transforms(nodes, order, parents)
+        for index in self._drawn_nodes(children, parents):
+            self._read_node(nodes[index], world[index], world)
+        if root.length("animations"):
+            self.notes["animations are left out: nodes stay where the file puts them"] += 1
+        if not self.shapes:
+            self.notes["the default scene has no triangles"] += 1
+        ignored = sorted(self.extensions.difference(SUPPORTED) | self.extensions & {*_SUBSTITUTED})
+        if ignored:
+            self.notes[f"extensions are ignored: {', '.join(ignored)}"] += 1
+        height = Scene.height
+        width = height if self.aspect is None else round(height * min(self.aspect, MAX_WIDTH))
+        return Scene(
+            path,
+            width=min(max(width, 1), MAX_WIDTH),
+            height=height,
+            cameras=tuple(self.cameras),
+            textures=tuple(self.texture_list),
+            materials=tuple(self.material_list) or (Material(),),
+            shapes=tuple(self.shapes),
+            lights=tuple(self.lights),
+            notes=tuple(
+                text if count == 1 else f"{text} ({count} times)"
+                for text, count in self.notes.items()
+            ),
+        )
+
+    def _drawn_nodes(self, children: list[list[int]], parents: list[int]) -> list[int]:
+        """Return the nodes below the roots of the default scene, parents first."""
+        root = self.gltf.root
+        scene_index = self.gltf.index(root, "scene", "scenes")
+        if scene_index is None and root.length("scenes"):
+            scene_index = 0
+        if scene_index is None:
+            self.notes["the file has no scene: all of its nodes are drawn"] += 1
+            pending = [index for index, parent in enumerate(parents) if parent < 0]
+        else:
+            scene = root.element("scenes", scene_index)
+            pending = self.gltf.indices(scene, "nodes", "nodes")
+        pending = pending[::-1]
+        drawn: dict[int, None] = {}
+        while pending:
+            index = pending.pop()
+            if index not in drawn:
+                drawn[index] = None
+                pending.extend(reversed(children[index]))
+        return list(drawn)
+
+    def _read_node(self, node: Item, transform: np.ndarray, world: list[np.ndarray]) -> None:
+        self.extensions.update(node.extension_names())
+        camera_index = self.gltf.index(node, "camera", "cameras")
+        if camera_index is not None:
+            self._read_camera(self.gltf.root.element("cameras", camera_index), node, transform)
+        light = node.extension("KHR_lights_punctual")
+        if light is not None:
+            self._read_light(light, transform)
+        mesh_index = self.gltf.index(node, "mesh", "meshes")
+        if mesh_index is not None:
+            skin_index = self.gltf.index(node, "skin", "skins")
+            if skin_index is not None:
+                transform = self._bind_transform(skin_index, world)
+            self._place_mesh(mesh_index, node, transform)
+
+    # Cameras and lights
+
+    def _read_camera(self, camera: Item, node: Item, transform: np.ndarray) -> None:
+        kind = camera.text("type")
+        if kind == "orthographic":
+            self.notes["orthographic cameras are left out"] += 1
+            return
+        if kind != "perspective":
+            camera.fail("type", "perspective or orthographic")
+        lens = camera.item("perspective")
+        fov_y = lens.number("yfov", low=1e-6, high=math.pi - 1e-6)
+        aspect = lens.number("aspectRatio", low=1e-6) if "aspectRatio" in lens else None
+        try:
+            pose = without_scale(transform)
+        except ValueError:
+            self.notes["cameras with a degenerate transform are left out"] += 1
+            return
+        if not self.cameras:
+            self.aspect = aspect
+        self.cameras.append(Camera(pose, fov_y, self._camera_name(node, camera)))
+
+    def _camera_name(self, node: Item, camera: Item) -> str:
+        name = node.text("name", "") or camera.text("name", "") or "camera"
+        taken = {other.name for other in self.cameras}
+        number = 2
+        unique = name
+        while unique in taken:
+            unique = f"{name}-{number}"
+            number += 1
+        return unique
+
+    def _read_light(self, use: Item, transform: np.ndarray) -> None:
+        """Add a light of KHR_lights_punctual; the scale of the node does not count."""
+        table = self.gltf.root.extension("KHR_lights_punctual") or Item(use.file, "", {})
+        index = use.integer("light")
+        count = table.length("lights")
+        if index >= count:
+            use.fail("light", f"an index of the file's lights, which has {count} entries")
+        light = table.element("lights", index)
+        kind = light.text("type")
+        if kind not in ("point", "spot", "directional"):
+            self.notes[f"lights of type {kind!r} are left out"] += 1
+            return
+        color = light.numbers("color", (1.0, 1.0, 1.0), 0.0, 1.0)
+        intensity = light.number("intensity", 1.0, 0.0)
+        reach = light.number("range", low=0.0) if "range" in light else math.inf
+        if reach == 0.0:
+            light.fail("range", "a number above 0")
+        cone = light.item("spot") if kind == "spot" else Item(light.file, "", {})
+        inner = cone.number("innerConeAngle", 0.0, 0.0, math.pi / 2)
+        outer = cone.number("outerConeAngle", math.pi / 4, 0.0, math.pi / 2 + 1e-6)
+        if inner >= outer:
+            cone.fail("innerConeAngle", f"less than outerConeAngle, {outer:.9g}")
+        length = np.linalg.norm(transform[:3, 2])
+        if kind != "point" and length == 0.0:
+            self.notes["lights with a degenerate transform are left out"] += 1
+            return
+        direction = -transform[:3, 2] / length if length > 0.0 else np.array([0.0, 0.0, -1.0])
+        self.lights.append(
+            Light(
+                kind,
+                tuple(intensity * channel for channel in color),
+                light.text("name", ""),
+                position=tuple(transform[:3, 3].tolist()),
+                direction=tuple(direction.tolist()),
+                range=reach,
+                inner_angle=inner,
+                outer_angle=outer,
+            )
+        )
+
+    # Meshes
+
+    def _place_mesh(self, mesh_index: int, node: Item, transform: np.ndarray) -> None:
+        item = self.gltf.root.element("meshes", mesh_index)
+        if mesh_index not in self.meshes:
+            self.meshes[mesh_index] = self._read_mesh(item)
+        name = node.text("name", "") or item.text("name", "") or node.place
+        for mesh, material_index in self.meshes[mesh_index]:
+            if len(self.shapes) == MAX_SHAPES:
+                node.fail("mesh", f"at most {MAX_SHAPES} primitives in all nodes together")
+            self.shapes.append(Shape(name, mesh, transform, self._material(material_index)))
+
+    def _read_mesh(self, item: Item) -> list[tuple[Mesh, int | None]]:
+        """Return the triangle meshes of all primitives with their material indices in the file."""
+        meshes = []
+        name = item.text("name", "") or item.place
+        for i in range(item.length("primitives")):
+            primitive = item.element("primitives", i)
+            self.extensions.update(primitive.extension_names())
+            try:
+                mesh = self._read_primitive(primitive, name)
+            except MissingData:
+                self.notes["primitives whose buffer has no data are left out"] += 1
+                continue
+            if mesh is not None:
+                meshes.append((mesh, self.gltf.index(primitive, "material", "materials")))
+        return meshes
+
+    def _read_primitive(self, primitive: Item, name: str) -> Mesh | None:
+        mode = primitive.integer("mode", _TRIANGLES)
+        if mode > _FAN:
+            primitive.fail("mode", "0 to 6")
+        attributes = primitive.item("attributes")
+        if mode < _TRIANGLES:
+            self.notes["points and lines are left out"] += 1
+            return None
+        positions = self.gltf.accessor(attributes, "POSITION", "VEC3", QUANTISED_OR_FLOAT)
+        if positions is None:
+            self.notes["primitives without POSITION are left out"] += 1
+            return None
+        normals = self.gltf.accessor(attributes, "NORMAL", "VEC3", QUANTISED_OR_FLOAT)
+        uvs = self.gltf.accessor(attributes, "TEXCOORD_0", "VEC2", QUANTISED_OR_FLOAT)
+        for key, values in (("NORMAL", normals), ("TEXCOORD_0", uvs)):
+            if values is not None and len(values) != len(positions):
+                expected = f"as many elements as POSITION, {len(positions)}"
+                attributes.fail(key, expected, str(len(values)))
+        for key in ("COLOR_0", "JOINTS_0"):
+            if key in attributes:
+                self.notes[f"the vertex attribute {key} is ignored"] += 1
+        if primitive.length("targets"):
+            self.notes["morph targets are left out: meshes keep their base form"] += 1
+        triangles = self._triangles(primitive, mode, len(positions))
+        if len(triangles) == 0:
+            return None
+
+        used = np.zeros(len(positions), bool)
+        used[triangles] = True
+        if not used.all():
+            # Primitives often share one large vertex buffer: keep what each needs.
+            triangles = (np.cumsum(used) - 1)[triangles]
+            positions = positions[used]
+            normals = None if normals is None else normals[used]
+            uvs = None if uvs is None else uvs[used]
+        if normals is not None:
+            normals = _unit_normals(normals, positions, triangles)
+        if uvs is not None:
+            uvs = np.where(np.isfinite(uvs), uvs, np.float32(0.0))
+        return Mesh(name, positions, triangles.astype(np.uint32), normals, uvs)
+
+    def _triangles(self, primitive: Item, mode: int, vertex_count: int) -> np.ndarray:
+        """Return ``(m, 3)`` vertex indices, all below ``vertex_count``."""
+        stored = self.gltf.accessor(primitive, "indices", "SCALAR", UNSIGNED, as_float=False)
+        if stored is None:
+            indices = np.arange(vertex_count)
+        else:
+            indices = stored[:, 0].astype(np.int64)
+            if indices.max() >= vertex_count:
+                expected = f"indices below {vertex_count}, the number of vertices"
+                primitive.fail("indices", expected, str(indices.max()))
+        if len(indices) < 3 or (mode == _TRIANGLES and len(indices) % 3):
+            self.notes["indices that make no whole triangle are left out"] += 1
+        return _assemble_triangles(indices, mode)
+
+    def _bind_transform(self, skin_index: int, world: list[np.ndarray]) -> np.ndarray:
+        """Return where the first joint of a skin puts the whole mesh.
+
+        In the bind pose all joints agree; the transform of the mesh's own node does not count
+        (section 3.7.3.3).
+        """
+        self.notes["skins are left out: meshes stand as their first joint places them"] += 1
+        skin = self.gltf.root.element("skins", skin_index)
+        joints = self.gltf.indices(skin, "joints", "nodes")
+        if not joints:
+            skin.fail("joints", "at least one node")
+        transform = world[joints[0]]
+        stored = self.gltf.accessor(skin, "inverseBindMatrices", "MAT4", FLOAT)
+        if stored is not None:
+            with np.errstate(over="ignore", invalid="ignore"):
+                transform = transform @ stored[0].reshape(4, 4).T.astype(float)
+            transform[3] = (0.0, 0.0, 0.0, 1.0)
+            if not np.isfinite(transform).all():
+                skin.fail("inverseBindMatrices", "an accessor of finite matrices")
+        return transform
+
+    # Materials and textures
+
+    def _material(self, index: int | None) -> int:
+        """Return the index in the scene of a material of the file; None is glTF's default."""
+        if index not in self.materials:
+            item = Item(self.gltf.root.file, "material", {})
+            if index is not None:
+                item = self.gltf.root.element("materials", index)
+            material = self._read_material(item)
+            self.materials[index] = len(self.material_list)
+            self.material_list.append(material)
+        return self.materials[index]
+
+    def _read_material(self, item: Item) -> Material:
+        empty = Item(item.file, "", {})
+        self.extensions.update(item.extension_names())
+        surface = item.item("pbrMetallicRoughness")
+        emissive = item.extension("KHR_materials_emissive_strength") or empty
+        refraction = item.extension("KHR_materials_ior") or empty
+        transmission = item.extension("KHR_materials_transmission") or empty
+        specular = item.extension("KHR_materials_specular") or empty
+
+        base = surface.numbers("baseColorFactor", (1.0, 1.0, 1.0, 1.0), 0.0, 1.0)
+        emission = item.numbers("emissiveFactor", (0.0, 0.0, 0.0), 0.0, 1.0)
+        strength = emissive.number("emissiveStrength", 1.0, 0.0)
+        alpha_mode = item.text("alphaMode", "OPAQUE")
+        if alpha_mode not in ("OPAQUE", "MASK", "BLEND"):
+            item.fail("alphaMode", "OPAQUE, MASK or BLEND")
+        cutoff = item.number("alphaCutoff", 0.5, 0.0)
+        if alpha_mode == "BLEND":
+            self.notes["alpha blending is replaced by a mask with cutoff 0.5"] += 1
+            cutoff = 0.5
+        ior = refraction.number("ior", 1.5, 0.0)
+        if 0.0 < ior < 1.0:
+            refraction.fail("ior", "0, or a number of at least 1")
+        if ior == 0.0:
+            self.notes["an ior of 0 is taken as 1.5"] += 1
+            ior = 1.5
+        self._note_ignored(
+            (item, "normalTexture"),
+            (surface, "metallicRoughnessTexture"),
+            (transmission, "transmissionTexture"),
+            (specular, "specularTexture"),
+            (specular, "specularColorTexture"),
+            (specular, "specularColorFactor"),
+        )
+        return Material(
+            item.text("name", "") or item.place,
+            base_color=base[:3],
+            base_color_texture=self._texture(surface, "baseColorTexture"),
+            alpha=base[3],
+            alpha_mode="opaque" if alpha_mode == "OPAQUE" else "mask",
+            alpha_cutoff=cutoff,
+            metallic=surface.number("metallicFactor", 1.0, 0.0, 1.0),
+            roughness=surface.number("roughnessFactor", 1.0, 0.0, 1.0),
+            specular=specular.number("specularFactor", 1.0, 0.0, 1.0),
+            ior=ior,
+            transmission=transmission.number("transmissionFactor", 0.0, 0.0, 1.0),
+            emission=tuple(channel * strength for channel in emission),
+            emission_texture=self._texture(item, "emissiveTexture") if any(emission) else -1,
+            double_sided=item.flag("doubleSided"),
+        )
+
+    def _note_ignored(self, *keys: tuple[Item, str]) -> None:
+        for item, key in keys:
+            if key in item:
+                self.notes[f"the material property {key} is ignored"] += 1
+
+    def _texture(self, owner: Item, key: str) -> int:
+        """Return the index in the scene of the texture that ``owner[key]`` uses, or -1 for none."""
+        if key not in owner:
+            return -1
+        info = owner.item(key)
+        self.extensions.update(info.extension_names())
+        if info.integer("texCoord", 0) != 0:
+            self.notes["textures with texture coordinates other than TEXCOORD_0 are ignored"] += 1
+            return -1
+        texture_index = self.gltf.index(info, "index", "textures")
+        if texture_index is None:
+            info.fail("index", "an index of textures")
+        texture = self.gltf.root.element("textures", texture_index)
+        image_index = self.gltf.index(texture, "source", "images")
+        webp = texture.extension("EXT_texture_webp")
+        if webp is not None:
+            image_index = self.gltf.index(webp, "source", "images")
+        if image_index is None:
+            self.notes["textures without an image are ignored"] += 1
+            return -1
+        wrap, magnification = self._sampler(texture)
+        used = (image_index, wrap, magnification)
+        if used not in self.textures:
+            image = self.gltf.root.element("images", image_index)
+            name = image.text("name", "") or image.place
+            try:
+                pixels = self._pixels(image_index, image)
+            except MissingData:
+                self.notes["textures whose buffer has no data are ignored"] += 1
+                return -1
+            self.textures[used] = len(self.texture_list)
+            self.texture_list.append(Texture(name, pixels, True, wrap, magnification))
+        return self.textures[used]
+
+    def _sampler(self, texture: Item) -> tuple[tuple[str, str], str]:
+        """Return the wrap modes of u and v, and the filter."""
+        index = self.gltf.index(texture, "sampler", "samplers")
+        if index is None:
+            return ("repeat", "repeat"), "linear"
+        sampler = self.gltf.root.element("samplers", index)
+        wrap = []
+        for key in ("wrapS", "wrapT"):
+            number = sampler.integer(key, 10497)
+            if number not in _WRAP:
+                sampler.fail(key, f"one of {', '.join(str(known) for known in _WRAP)}")
+            wrap.append(_WRAP[number])
+        number = sampler.integer("magFilter", 9729)
+        if number not in _FILTER:
+            sampler.fail("magFilter", f"one of {', '.join(str(known) for known in _FILTER)}")
+        return (wrap[0], wrap[1]), _FILTER[number]
+
+    def _pixels(self, index: int, image: Item) -> np.ndarray:
+        if index not in self.pixels:
+            if "uri" in image:
+                data = self.gltf.resource(image)
+            else:
+                view_index = self.gltf.index(image, "bufferView", "bufferViews")
+                if view_index is None:
+                    image.fail("bufferView", "an index of bufferViews, or a uri")
+                data = bytes(self.gltf.view_data(view_index))
+            self.pixels[index] = decode_pixels(data, f"{image.file}: {image.place}")
+        return self.pixels[index]
+
+
+def _check_version(asset: Item) -> None:
+    """Refuse anything but glTF 2 that a reader of 2.0 may read."""
+    for key, default in (("version", None), ("minVersion", "2.0")):
+        version = asset.text(key, default)
+        major, _, minor = version.partition(".")
+        if major != "2" or not minor.isdecimal() or (key == "minVersion" and int(minor) > 0):
+            asset.fail(key, "glTF 2.0")
+
+
+def _check_required(root: Item) -> None:
+    for name in root.texts("extensionsRequired"):
+        if name not in SUPPORTED:
+            known = ", ".join(SUPPORTED)
+            root.fail("extensionsRequired", f"none but {known}", reprlib.repr(name))
+
+
+def _order_nodes(nodes: list[Item], children: list[list[int]]) -> tuple[list[int], list[int]]:
+    """Return all nodes, parents first, and each one's parent, -1 for none.
+
+    Raises:
+        InputError: a node has two parents or is its own ancestor.
+    """
+    parents = [-1] * len(nodes)
+    for index, below in enumerate(children):
+        for child in below:
+            if parents[child] >= 0:
+                nodes[index].fail("children", f"nodes without another parent (nodes[{child}] has)")
+            parents[child] = index
+    order = [index for index, parent in enumerate(parents) if parent < 0]
+    for index in order:  # grows as it is read
+        order.extend(children[index])
+    if len(order) < len(nodes):
+        looped = min(set(range(len(nodes))).difference(order))
+        nodes[looped].fail("children", "no cycle")
+    return order, parents
+
+
+def _world_transforms(nodes: list[Item], order: list[int], parents: list[int]) -> list[np.ndarray]:
+    """Return the ``(4, 4)`` float64 node-to-world matrix of every node."""
+    world = [np.eye(4)] * len(nodes)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for index in order:
+            node = nodes[index]
+            matrix = _local_transform(node)
+            if parents[index] >= 0:
+                matrix = world[parents[index]] @ matrix
+            if not np.isfinite(matrix).all():
+                place = f"{node.file}: {node.place}"
+                raise InputError(f"{place}: expected a finite transform, got overflow")
+            world[index] = matrix
+    return world
+
+
+def _local_transform(node: Item) -> np.ndarray:
+    if "matrix" in node:
+        if any(key in node for key in ("translation", "rotation", "scale")):
+            node.fail("matrix", "no translation, rotation or scale beside it")
+        # Stored by columns.
+        matrix = np.array(node.numbers("matrix", np.eye(4).ravel().tolist())).reshape(4, 4).T
+        if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=1e-5):
+            node.fail("matrix", "an affine matrix: entries 3, 7, 11, 15 being 0, 0, 0, 1")
+        matrix[3] = (0.0, 0.0, 0.0, 1.0)
+        return matrix
+    # The product translation * rotation * scale, written out: files can have very many nodes.
+    matrix = np.eye(4)
+    if "rotation" in node:
+        try:
+            matrix = rotation_quaternion(node.numbers("rotation", (0.0, 0.0, 0.0, 1.0)))
+        except ValueError:
+            node.fail("rotation", "a quaternion that is not zero")
+    if "scale" in node:
+        matrix[:3, :3] *= node.numbers("scale", (1.0, 1.0, 1.0))
+    if "translation" in node:
+        matrix[:3, 3] = node.numbers("translation", (0.0, 0.0, 0.0))
+    return matrix
+
+
+def _assemble_triangles(indices: np.ndarray, mode: int) -> np.ndarray:
+    """Return ``(m, 3)`` triangles of a list, strip or fan of indices (section 3.7.2.1)."""
+    if mode == _TRIANGLES:
+        return indices[: len(indices) // 3 * 3].reshape(-1, 3)
+    first = np.arange(max(len(indices) - 2, 0))
+    if mode == _STRIP:
+        odd = first % 2
+        return indices[np.stack([first, first + 1 + odd, first + 2 - odd], axis=1)]
+    return indices[np.stack([first + 1, first + 2, first * 0], axis=1)]
+
+
+def _unit_normals(normals: np.ndarray, positions: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return ``(n, 3)`` float32 normals of length 1.
+
+    Zero and non-finite ones become the area-weighted mean normal of the triangles around.
+    """
+    # Signalling NaNs and overflow warn where they are computed with; they are sorted out here.
+    with np.errstate(over="ignore", invalid="ignore"):
+        unit, good = _normalised(normals.astype(float))
+        if not good.all():
+            corners = positions.astype(float)[triangles]
+            faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            faces[~np.isfinite(faces).all(axis=1)] = 0.0
+            around = np.zeros_like(unit)
+            for corner in range(3):
+                np.add.at(around, triangles[:, corner], faces)
+            mean, _ = _normalised(around)
+            unit[~good] = mean[~good]
+    return unit.astype(np.float32)
+
+
+def _normalised(vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit vectors, +Z in place of what has no direction, and which had one."""
+    length = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+    good = np.isfinite(length) & (length > 0.0)
+    unit = np.tile([0.0, 0.0, 1.0], (len(vectors), 1))
+    np.divide(vectors, length[:, None], out=unit, where=good[:, None])
+    return unit, good

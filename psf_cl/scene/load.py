@@ -1,0 +1,159 @@
+"""The front door: any scene file to a Scene that can be rendered."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from psf_cl.errors import InputError
+from psf_cl.scene import mesh, transform
+from psf_cl.scene.environment import load_environment
+from psf_cl.scene.gltf import load_gltf
+from psf_cl.scene.model import Camera, Environment, Scene, Shape
+from psf_cl.scene.toml_file import MAX_SIZE, load_toml
+
+DEFAULT_FOV_Y = math.radians(45)
+DEFAULT_SKY = (1.0, 1.0, 1.0)
+
+_GLTF = (".gltf", ".glb")
+_MESH_FILES = (*_GLTF, *mesh.SUFFIXES)
+
+
+def load_scene(
+    path: str | Path,
+    *,
+    environment: str | Path | None = None,
+    camera: str | None = None,
+    size: tuple[int, int] | None = None,
+) -> Scene:
+    """Read a scene and complete it, so that it has triangles, a camera and light.
+
+    Without a camera the view frames the scene; without any light there is a sky of radiance 1.
+    Both are told in ``Scene.notes``.
+
+    Args:
+        environment: an .exr or .hdr file to use instead of the scene's environment.
+        camera: name of the camera to use.
+        size: width and height in pixels instead of the scene's.
+
+    Raises:
+        InputError: missing, unknown or malformed file, no triangles, no camera of that name, or a
+            size out of range.
+    """
+    path = Path(path)
+    scene = load_toml(path, _load_mesh_file) if _suffix(path) == ".toml" else _load_mesh_file(path)
+    if not any(len(shape.mesh.triangles) for shape in scene.shapes):
+        raise InputError(f"{path} has no triangles")
+    if environment is not None:
+        image, notes = load_environment(Path(environment))
+        scene = replace(
+            scene, environment=Environment((1.0, 1.0, 1.0), image), notes=scene.notes + notes
+        )
+    return _without_unused(_with_light(_with_camera(_with_size(scene, size), camera)))
+
+
+def _suffix(path: Path) -> str:
+    suffix = path.suffix.lower()
+    if suffix not in (".toml", *_MESH_FILES):
+        raise InputError(f"{path}: expected a file ending in .toml, {', '.join(_MESH_FILES)}")
+    return suffix
+
+
+def _load_mesh_file(path: Path) -> Scene:
+    suffix = path.suffix.lower()
+    if suffix not in _MESH_FILES:
+        raise InputError(f"{path}: expected a file ending in {', '.join(_MESH_FILES)}")
+    return load_gltf(path) if suffix in _GLTF else mesh.load_mesh_scene(path)
+
+
+def _with_size(scene: Scene, size: tuple[int, int] | None) -> Scene:
+    if size is None:
+        return scene
+    width, height = size
+    if not (1 <= width <= MAX_SIZE and 1 <= height <= MAX_SIZE):
+        raise InputError(f"size: expected 1 to {MAX_SIZE} pixels each; got {width}x{height}")
+    return replace(scene, width=width, height=height)
+
+
+def _with_camera(scene: Scene, name: str | None) -> Scene:
+    if name is not None:
+        names = [camera.name for camera in scene.cameras]
+        if name not in names:
+            known = ", ".join(map(repr, names)) or "it has none"
+            raise InputError(f"{scene.path}: no camera {name!r}; known: {known}")
+        return replace(scene, camera=names.index(name))
+    if scene.cameras:
+        return scene
+    note = "The file has no camera: the view frames the whole scene."
+    return replace(
+        scene, cameras=(framing_camera(scene),), camera=0, notes=(*scene.notes, note)
+    )
+
+
+def framing_camera(scene: Scene) -> Camera:
+    """Return a view from the front, right and above that shows all finite vertices.
+
+    Raises:
+        InputError: no vertex of a triangle is finite.
+    """
+    bounds = [corners for shape in scene.shapes if (corners := _bounds(shape)) is not None]
+    if not bounds:
+        raise InputError(f"{scene.path} has no triangles with finite vertices")
+    low = np.min([corners[0] for corners in bounds], axis=0)
+    high = np.max([corners[1] for corners in bounds], axis=0)
+    center = (low + high) / 2
+    # A single point still needs a distance, and one that float32 can tell from its position.
+    radius = max(float(np.linalg.norm(high - low)) / 2, 1e-4 * float(np.abs(center).max()), 1e-6)
+    half_y = DEFAULT_FOV_Y / 2
+    half_x = math.atan(math.tan(half_y) * scene.width / scene.height)
+    distance = radius / math.sin(min(half_x, half_y))
+    direction = np.array([0.5, 0.4, 1.0]) / np.linalg.norm([0.5, 0.4, 1.0])
+    view = transform.look_at(center + distance * direction, center, (0.0, 1.0, 0.0))
+    return Camera(view, DEFAULT_FOV_Y, focus_distance=distance)
+
+
+def _bounds(shape: Shape) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the least and greatest world coordinates of the vertices that triangles use."""
+    used = np.zeros(len(shape.mesh.positions), bool)
+    used[shape.mesh.triangles.reshape(-1)] = True
+    used &= np.isfinite(shape.mesh.positions).all(axis=1)
+    points = transform.transform_points(shape.transform, shape.mesh.positions[used])
+    return (points.min(axis=0), points.max(axis=0)) if len(points) else None
+
+
+def _with_light(scene: Scene) -> Scene:
+    sky = scene.environment
+    emitting = any(any(scene.materials[shape.material].emission) for shape in scene.shapes)
+    shining = any(any(light.intensity) for light in scene.lights)
+    glowing = any(sky.radiance) and (sky.image is None or bool(np.any(sky.image)))
+    if emitting or shining or glowing:
+        return scene
+    note = "The scene has no light: a sky of constant radiance (1, 1, 1) is added."
+    return replace(scene, environment=Environment(DEFAULT_SKY), notes=(*scene.notes, note))
+
+
+def _without_unused(scene: Scene) -> Scene:
+    """Return the scene without materials that no shape has and textures that no material has."""
+    kept = sorted({shape.material for shape in scene.shapes})
+    fields = ("base_color_texture", "emission_texture")
+    textures = {getattr(scene.materials[index], name) for index in kept for name in fields}
+    order = sorted(textures - {-1})
+    new_texture = {-1: -1} | {old: new for new, old in enumerate(order)}
+    new_material = {old: new for new, old in enumerate(kept)}
+    return replace(
+        scene,
+        textures=tuple(scene.textures[index] for index in order),
+        materials=tuple(
+            replace(
+                scene.materials[index],
+                **{name: new_texture[getattr(scene.materials[index], name)] for name in fields},
+            )
+            for index in kept
+        ),
+        shapes=tuple(
+            replace(shape, material=new_material[shape.material]) for shape in scene.shapes
+        ),
+    )

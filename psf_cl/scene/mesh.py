@@ -1,0 +1,350 @@
+"""OBJ, PLY and STL files: trimesh reads them, this module checks what it returns.
+
+The format readers of trimesh are called directly: its mesh class would merge and reorder.  It also
+drops what an MTL file says about emission and missing textures, so the MTL is read here; OBJ text
+is put into the plain form that trimesh's reader expects first.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import re
+import struct
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psf_cl.errors import InputError
+from psf_cl.scene.input_file import read_file
+from psf_cl.scene.model import Material, Mesh, Scene, Shape, Texture
+from psf_cl.scene.texture import load_texture
+
+SUFFIXES = (".obj", ".ply", ".stl")
+
+# What trimesh 5.2 lets out for malformed files: text that is no number (ValueError, and
+# DeprecationWarning made an error below), missing columns and indices out of range (IndexError),
+# unknown property types and names (KeyError, UnboundLocalError), absent data (TypeError,
+# AttributeError), and counts that no memory holds (OverflowError, MemoryError).
+_READER_ERRORS = (
+    ValueError,
+    DeprecationWarning,
+    IndexError,
+    KeyError,
+    UnboundLocalError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+    MemoryError,
+    struct.error,
+)
+
+
+def load_mesh_scene(path: Path) -> Scene:
+    """Return the shapes of an OBJ, PLY or STL file, one a material, with OBJ's materials.
+
+    Normals and texture coordinates are kept where the file has them; vertices that are not finite
+    are kept too.  Polygons become fans of triangles.  Missing material files and textures are
+    noted.
+
+    Raises:
+        InputError: missing or malformed file, or an index out of range.
+    """
+    data = read_file(path)
+    if path.suffix.lower() == ".obj":
+        return _load_obj(path, data)
+    return _load_ply(path, data) if path.suffix.lower() == ".ply" else _load_stl(path, data)
+
+
+def _load_ply(path: Path, data: bytes) -> Scene:
+    from trimesh.exchange.ply import load_ply
+
+    read = _guarded(path, "PLY", lambda: load_ply(io.BytesIO(data), skip_materials=True))
+    textures: list[Texture] = []
+    lost: list[str] = []
+    material = Material()
+    # MeshLab's way to name a texture.
+    named = re.search(rb"^comment TextureFile (.+?)\s*$", data[:4096], re.MULTILINE)
+    if named is not None:
+        name = named[1].decode("utf-8", "replace")
+        material = Material(base_color_texture=_texture_index(path, name, textures, lost))
+    return Scene(
+        path=str(path),
+        shapes=_shapes(path, [read]),
+        materials=(material,),
+        textures=tuple(textures),
+        notes=tuple(f"Left out: {reason}." for reason in lost),
+    )
+
+
+def _load_stl(path: Path, data: bytes) -> Scene:
+    from trimesh.exchange.stl import HeaderError, load_stl
+
+    read = _guarded(path, "STL", lambda: load_stl(io.BytesIO(data)), HeaderError)
+    # A file with several solids has a table of meshes, any other is the mesh itself.
+    shapes = _shapes(path, read.get("geometry", {"": read}).values())
+    if not shapes and data.lstrip()[:5].lower() != b"solid":
+        raise InputError(f"{path}: neither ASCII STL nor binary STL of the length in its header")
+    return Scene(path=str(path), shapes=shapes)
+
+
+def _shapes(path: Path, parts: Iterable[dict[str, Any]]) -> tuple[Shape, ...]:
+    meshes = [_checked_mesh(path, path.stem, part) for part in parts]
+    return tuple(Shape(mesh.name, mesh, np.eye(4), 0) for mesh in meshes if mesh is not None)
+
+
+def _guarded(
+    path: Path, name: str, read: Callable[[], dict[str, Any]], *more: type[Exception]
+) -> dict[str, Any]:
+    """Return what ``read`` returns; what it raises becomes an InputError."""
+    try:
+        with warnings.catch_warnings():
+            # At text that is no number NumPy only warns, and drops the rest of the file.
+            warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
+            warnings.filterwarnings("ignore", category=RuntimeWarning)
+            return read()
+    except (*_READER_ERRORS, *more) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise InputError(f"{path}: not a sound {name} file ({reason})") from None
+
+
+def _checked_mesh(path: Path, name: str, part: dict[str, Any]) -> Mesh | None:
+    """Return trimesh's raw arrays as a mesh with every index checked; None if it has no faces."""
+    faces = part.get("faces")
+    if faces is None or np.size(faces) == 0:
+        return None
+    faces = np.asarray(faces)
+    positions = _float32(part["vertices"])
+    if faces.ndim != 2 or faces.dtype.kind not in "iu" or faces.shape[1] < 3:
+        raise InputError(f"{path}: expected faces of at least 3 integer vertex indices")
+    low, high = int(faces.min()), int(faces.max())
+    if low < 0 or high >= len(positions):
+        bad = low if low < 0 else high
+        raise InputError(f"{path}: vertex index {bad} is out of range; there are {len(positions)}")
+    fan = [faces[:, [0, corner, corner + 1]] for corner in range(1, faces.shape[1] - 1)]
+    visual = part.get("visual")
+    uvs = getattr(visual, "uv", None)
+    uvs = None if uvs is None or np.shape(uvs) != (len(positions), 2) else _float32(uvs)
+    if uvs is not None:
+        # v grows upwards in these formats.
+        uvs = np.stack([uvs[:, 0], 1 - uvs[:, 1]], axis=-1)
+    return Mesh(
+        name=name,
+        positions=positions,
+        triangles=np.stack(fan, axis=1).reshape(-1, 3).astype(np.uint32),
+        normals=_unit_normals(part.get("vertex_normals"), len(positions)),
+        uvs=uvs,
+    )
+
+
+def _unit_normals(normals: Any, count: int) -> np.ndarray | None:
+    """Return unit normals; None unless each vertex has one of finite, nonzero length."""
+    if normals is None or np.shape(normals) != (count, 3):
+        return None
+    normals = np.asarray(normals, np.float64)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    if not (np.isfinite(length) & (length > 0)).all():
+        return None
+    return (normals / length).astype(np.float32)
+
+
+def _float32(values: Any) -> np.ndarray:
+    # A coordinate beyond float32 becomes infinite, and its triangles are dropped with NaN's.
+    with np.errstate(over="ignore"):
+        return np.ascontiguousarray(values, dtype=np.float32)
+
+
+class _MaterialNames:
+    """Stand in for trimesh's file resolver: the only file it finds lists the material names.
+
+    With it trimesh tells which faces use which material even where the MTL file is missing.
+    """
+
+    def __init__(self, text: str) -> None:
+        names = dict.fromkeys(re.findall(r"^usemtl (.+)$", text, re.MULTILINE))
+        self._mtl = "".join(f"newmtl {name}\n" for name in names).encode()
+
+    def __getitem__(self, name: str) -> bytes:
+        return self._mtl
+
+    get = __getitem__
+
+
+def _load_obj(path: Path, data: bytes) -> Scene:
+    from trimesh.exchange.obj import load_obj
+
+    try:
+        text = data.decode("utf-8")
+    except UnicodeDecodeError:
+        text = data.decode("latin-1")
+    text = _plain_obj(path, text)
+    libraries = re.findall(r"^mtllib (.+)$", text, re.MULTILINE)
+    text = "mtllib names\n" + text
+    resolver: Any = _MaterialNames(text)
+    read = _guarded(path, "OBJ", lambda: load_obj(io.StringIO(text), resolver=resolver))
+
+    notes: list[str] = []
+    textures: list[Texture] = []
+    known = _read_libraries(path, libraries, textures, notes)
+    materials: dict[str, Material] = {}
+    shapes = []
+    unknown = set()
+    for part in read.get("geometry", {}).values():
+        used = getattr(part.get("visual"), "material", None)
+        name = str(used.name) if used is not None and used.name else Material().name
+        mesh = _checked_mesh(path, name, part)
+        if mesh is None:
+            continue
+        if name not in known and name != Material().name:
+            unknown.add(name)
+        materials.setdefault(name, known.get(name, Material(name=name)))
+        shapes.append(Shape(name, mesh, np.eye(4), list(materials).index(name)))
+    if unknown:
+        notes.append(f"{path}: {len(unknown)} materials are not defined and stay grey.")
+    return Scene(
+        path=str(path),
+        shapes=tuple(shapes),
+        materials=tuple(materials.values()) or (Material(),),
+        textures=tuple(textures),
+        notes=tuple(notes),
+    )
+
+
+def _plain_obj(path: Path, text: str) -> str:
+    """Return OBJ text in the one form that trimesh reads without mistakes.
+
+    No comments, continuations, tabs and indents.  No negative indices: trimesh counts them from the
+    end of the file, not from the line that they stand on.  Every corner of the form of the first
+    one: where some corners lack a texture coordinate or a normal, they get (0, 0) and a normal of
+    no length, which ``_unit_normals`` refuses.
+    """
+    text = re.sub(r"\r\n?", "\n", text).replace("\\\n", " ")
+    text = re.sub(r"[ \t]+", " ", text)
+    text = re.sub(r"^ ?#.*| #.*$|^ | $", "", text, flags=re.MULTILINE)
+    if re.search(r"^f (?:.*[ /])?0(?:[ /]|$)", text, re.MULTILINE):
+        raise InputError(f"{path}: a face has the index 0; OBJ counts from 1")
+    first_corners = re.findall(r"^f -?\d+(?:/(-?\d*))?(?:/(-?\d+))?", text, re.MULTILINE)
+    forms = {(bool(uv), bool(normal)) for uv, normal in first_corners}
+    if len(forms) < 2 and not re.search(r"^f .*-", text, re.MULTILINE):
+        return text
+
+    lines = text.split("\n")
+    total = {word: sum(line.startswith(word + " ") for line in lines) for word in ("v", "vt", "vn")}
+    missing = ["", "", ""]
+    if len(forms) > 1:
+        missing = ["", str(total["vt"] + 1), str(total["vn"] + 1)]
+        lines += ["vt 0 0", "vn 0 0 0"]
+    seen = dict.fromkeys(total, 0)
+    for row, line in enumerate(lines):
+        keyword, _, corners = line.partition(" ")
+        if keyword in seen:
+            seen[keyword] += 1
+        elif keyword == "f":
+            plain = [_absolute_corner(corner, list(seen.values())) for corner in corners.split()]
+            if any(corner is None for corner in plain):
+                raise InputError(f"{path}: an index of {line[:60]!r} is out of range")
+            lines[row] = "f " + " ".join(_joined(corner, missing) for corner in plain if corner)
+    return "\n".join(lines)
+
+
+def _joined(corner: list[str], missing: list[str]) -> str:
+    parts = [index or other for index, other in zip(corner, missing, strict=True)]
+    return "/".join(parts).rstrip("/")
+
+
+def _absolute_corner(corner: str, seen: list[int]) -> list[str] | None:
+    """Return vertex, uv and normal index of ``v/vt/vn``, absent ones as ""; None if out of range.
+
+    A negative index counts back from the last of the ``seen`` entries.
+    """
+    parts = ["", "", ""]
+    for place, index in enumerate(corner.split("/")[:3]):
+        if re.fullmatch(r"-\d{1,18}", index):
+            absolute = seen[place] + 1 + int(index)
+            if absolute < 1:
+                return None
+            index = str(absolute)
+        parts[place] = index
+    return parts
+
+
+def _read_libraries(
+    path: Path, libraries: list[str], textures: list[Texture], notes: list[str]
+) -> dict[str, Material]:
+    """Return the materials of all ``mtllib`` lines; fill ``textures`` and ``notes``."""
+    known: dict[str, Material] = {}
+    lost_textures: list[str] = []
+    for library in libraries:
+        # A line names one file with spaces in its name, or several files.
+        names = [library] if os.path.isfile(path.parent / library) else library.split()
+        for name in names:
+            try:
+                text = read_file(path.parent / name).decode("utf-8", "replace")
+            except InputError as error:
+                notes.append(f"Materials are left out: {error}.")
+                continue
+            known |= _parse_mtl(path, text, textures, lost_textures)
+    if lost_textures:
+        first = lost_textures[0]
+        notes.append(f"{path}: {len(lost_textures)} textures are left out (the first: {first}).")
+    return known
+
+
+def _parse_mtl(
+    path: Path, text: str, textures: list[Texture], lost_textures: list[str]
+) -> dict[str, Material]:
+    """Return the materials of an MTL file: ``Kd``, ``Ke``, ``map_Kd``; the rest is passed over."""
+    known: dict[str, Material] = {}
+    name = ""
+    for line in text.splitlines():
+        keyword, _, rest = line.strip().replace("\t", " ").partition(" ")
+        rest = rest.strip()
+        if keyword == "newmtl" and rest:
+            name = " ".join(rest.split())
+            known[name] = Material(name=name)
+        elif name and keyword in ("Kd", "Ke"):
+            color = _color(rest)
+            if color is None:
+                continue
+            if keyword == "Kd":
+                known[name] = replace(known[name], base_color=tuple(min(c, 1.0) for c in color))
+            else:
+                known[name] = replace(known[name], emission=color)
+        elif name and keyword == "map_Kd" and rest:
+            index = _texture_index(path, rest, textures, lost_textures)
+            known[name] = replace(known[name], base_color_texture=index)
+    return known
+
+
+def _color(text: str) -> tuple[float, float, float] | None:
+    """Return the RGB of ``r g b`` or ``r``; None unless it is finite and not negative."""
+    try:
+        values = [float(word) for word in text.split()[:3]]
+    except ValueError:
+        return None
+    if len(values) == 1:
+        values *= 3
+    if len(values) != 3 or not all(math.isfinite(value) and value >= 0 for value in values):
+        return None
+    return values[0], values[1], values[2]
+
+
+def _texture_index(path: Path, text: str, textures: list[Texture], lost_textures: list[str]) -> int:
+    """Load the texture that a ``map_Kd`` line names and return its index; -1 if it can't be."""
+    # Options like "-s 1 1 1" come before the name and vary in length: the last word is the name.
+    name = (text.split()[-1] if text.startswith("-") else text).replace("\\", "/")
+    for index, texture in enumerate(textures):
+        if texture.name == name:
+            return index
+    try:
+        loaded = load_texture(path.parent / name)
+    except InputError as error:
+        lost_textures.append(str(error))
+        return -1
+    textures.append(replace(loaded, name=name))
+    return len(textures) - 1

@@ -1,0 +1,123 @@
+"""What the user may choose: one frozen record, checked once, with presets as plain differences.
+
+A setting exists only if something implements it.  Choices are strings, so that a scene file, the
+command line and Python spell them alike.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from psf_cl.errors import InputError
+
+
+def _choice(default: str, *others: str, doc: str) -> Any:
+    return field(default=default, metadata={"choices": (default, *others), "doc": doc})
+
+
+def _number(default: Any, low: Any, high: Any, *, doc: str) -> Any:
+    return field(default=default, metadata={"range": (low, high), "doc": doc})
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All that changes the estimator.  Anything else (output, device, budget) is not a setting."""
+
+    integrator: str = _choice("path", doc="how paths are built")
+    light_sampling: str = _choice("power", "uniform", doc="how next event estimation picks an emitter")
+    direct_sampling: str = _choice(
+        "mis", "light", "bsdf", doc="direct light by both strategies, or by one of them alone"
+    )
+    termination: str = _choice("roulette", "off", doc="how paths end before max_depth")
+    roulette_depth: int = _number(5, 0, 1 << 20, doc="bounces before Russian roulette may end a path")
+    max_depth: int = _number(16, 0, 1 << 20, doc="bounces; 0 is what the camera sees directly")
+    sampler: str = _choice("sobol", "random", doc="Owen-scrambled Sobol' points, or independent numbers")
+    seed: int = _number(0, 0, 0xFFFFFFFF, doc="start of every random sequence")
+
+    def __post_init__(self) -> None:
+        for item in dataclasses.fields(self):
+            object.__setattr__(self, item.name, _checked(item, getattr(self, item.name), "settings"))
+
+    def with_values(self, values: Mapping[str, Any], source: str = "settings") -> Settings:
+        """Return a copy with ``values`` applied; errors name ``source`` and the key.
+
+        Strings are taken for numbers where the setting is a number (``--set max_depth=4``).
+
+        Raises:
+            InputError: unknown key, wrong type, or a value out of range.
+        """
+        known = {item.name: item for item in dataclasses.fields(self)}
+        checked = {}
+        for key, value in values.items():
+            if key not in known:
+                close = difflib.get_close_matches(key, known, n=1)
+                hint = f"; did you mean {close[0]}?" if close else f"; known: {', '.join(known)}"
+                raise InputError(f"{source}: unknown setting {key!r}{hint}")
+            checked[key] = _checked(known[key], value, source)
+        return dataclasses.replace(self, **checked)
+
+
+def _checked(item: dataclasses.Field[Any], value: Any, source: str) -> Any:
+    choices = item.metadata.get("choices")
+    if choices is not None:
+        if value not in choices:
+            raise InputError(f"{source}: {item.name} must be one of {', '.join(choices)}; got {value!r}")
+        return value
+    low, high = item.metadata["range"]
+    kind = type(item.default)
+    wanted = "an integer" if kind is int else "a number"
+    try:
+        number = kind(value) if isinstance(value, str) else value
+    except ValueError:
+        number = None
+    if isinstance(number, bool) or not isinstance(number, (int, float) if kind is float else int):
+        raise InputError(f"{source}: {item.name} must be {wanted} from {low} to {high}; got {value!r}")
+    if not (math.isfinite(number) and low <= number <= high):
+        raise InputError(f"{source}: {item.name} must be from {low} to {high}; got {value!r}")
+    return kind(number)
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "pt": {},
+}
+
+
+def preset_values(name: str, source: str = "settings") -> dict[str, Any]:
+    """Return what preset ``name`` changes.
+
+    Raises:
+        InputError: there is no such preset.
+    """
+    if name not in PRESETS:
+        raise InputError(f"{source}: preset must be one of {', '.join(PRESETS)}; got {name!r}")
+    return PRESETS[name]
+
+
+def resolve(
+    scene_values: Mapping[str, Any],
+    scene_source: str,
+    preset: str | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> Settings:
+    """Combine defaults < scene preset < scene ``[render]`` < ``preset`` < ``overrides``.
+
+    Args:
+        scene_values: the scene file's ``[render]`` table; its key ``preset`` names a preset.
+        scene_source: what to name in errors about ``scene_values``.
+    """
+    settings = Settings()
+    values = dict(scene_values)
+    if "preset" in values:
+        name = values.pop("preset")
+        if not isinstance(name, str):
+            raise InputError(f"{scene_source}: preset must be a string; got {name!r}")
+        settings = settings.with_values(preset_values(name, scene_source), scene_source)
+    settings = settings.with_values(values, scene_source)
+    if preset is not None:
+        settings = settings.with_values(preset_values(preset, "--preset"), "--preset")
+    return settings.with_values(overrides or {}, "--set")

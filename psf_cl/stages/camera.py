@@ -1,0 +1,31 @@
+"""Camera: hand in finished paths and start new ones in their slots."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from psf_cl.device import layout
+from psf_cl.stages.spec import BufferSpec, Context, StageSpec
+
+
+def plan(context: Context) -> StageSpec:
+    """Return the stage; every render has it."""
+    slots = context.traits.slots
+    samples = context.ring * context.pixel_count * 4
+    float32, uint32 = np.dtype(np.float32), np.dtype(np.uint32)
+    buffers = [
+        BufferSpec("pool", float32, slots * len(layout.PATH_FIELDS), f"state of {slots} paths"),
+        BufferSpec("pixel_order", uint32, context.pixel_count, "pixels in the order of the queue"),
+        BufferSpec("counters", uint32, layout.COUNTER_INDEX["finished"] + context.ring, "queue and rays"),
+        BufferSpec("samples", float32, samples, f"radiance of {context.ring} passes in flight"),
+    ]
+    if context.on("AOV_DIRECT"):
+        buffers.append(BufferSpec("direct", float32, samples, "direct light of the same"))
+    return StageSpec(
+        "camera",
+        "paths start at the camera",
+        "camera.cl",
+        flags=("LENS", "AOV_DIRECT"),
+        kernels=("regenerate_paths",),
+        buffers=tuple(buffers),
+    )

@@ -1,0 +1,18 @@
+"""Connect: the shadow rays of next event estimation."""
+
+from __future__ import annotations
+
+from psf_cl.stages.spec import Context, StageSpec
+
+
+def plan(context: Context) -> StageSpec | None:
+    """Return the stage, or None if the scene has no light to connect to."""
+    if not any(context.on(name) for name in ("AREA_LIGHTS", "PUNCTUAL_LIGHTS", "ENVIRONMENT")):
+        return None
+    return StageSpec(
+        "connect",
+        "sampled lights need to be seen",
+        "connect.cl",
+        flags=("ALPHA", "AOV_DIRECT"),
+        kernels=("connect_lights",),
+    )

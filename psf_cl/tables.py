@@ -1,0 +1,383 @@
+"""Scene to the tables that the device reads: NumPy only."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from psf_cl.device import layout
+from psf_cl.errors import InputError
+from psf_cl.scene.model import Camera, Environment, Light, Material, Scene, Texture
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+
+#: Chance that the light table keeps for emitters of finite size where there is also light from
+#: infinitely far: its flux through the scene says little about how much of it comes in.
+NEAR_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Every triangle of the scene in world space.
+
+    Attributes:
+        positions: ``(n, 9)`` float32, the three corners; m.
+        surfaces: ``(n,)`` layout.SURFACE, ``light`` still NO_LIGHT.
+        normals: ``(n,)`` layout.NORMALS, or None if every shape is flat.
+        uvs: ``(n,)`` layout.UVS, or None if nothing has coordinates.
+        centre, radius: a sphere around all finite vertices; m.
+    """
+
+    positions: np.ndarray
+    surfaces: np.ndarray
+    normals: np.ndarray | None
+    uvs: np.ndarray | None
+    centre: np.ndarray
+    radius: float
+
+    @property
+    def count(self) -> int:
+        return len(self.surfaces)
+
+
+def flatten(scene: Scene) -> Geometry:
+    """Return the triangles of all shapes, in the order of the shapes."""
+    positions, surfaces, normals, uvs = [], [], [], []
+    smooth = any(shape.mesh.normals is not None for shape in scene.shapes)
+    mapped = any(shape.mesh.uvs is not None for shape in scene.shapes)
+    for shape in scene.shapes:
+        mesh = shape.mesh
+        linear = shape.transform[:3, :3]
+        with np.errstate(all="ignore"):  # What overflows here is dropped, and counted, as not finite.
+            world = (mesh.positions @ linear.T + shape.transform[:3, 3]).astype(np.float32)
+            corners = world[mesh.triangles]
+            surface = np.zeros(len(corners), layout.SURFACE.dtype)
+            surface["p0"] = corners[:, 0]
+            surface["e1"] = corners[:, 1] - corners[:, 0]
+            surface["e2"] = corners[:, 2] - corners[:, 0]
+            determinant = np.linalg.det(linear)
+        surface["material"] = shape.material
+        surface["light"] = layout.CONSTANT["NO_LIGHT"]
+        surface["flip"] = -1.0 if determinant < 0 else 1.0
+        positions.append(corners.reshape(-1, 9))
+        surfaces.append(surface)
+        if smooth:
+            record = np.zeros(len(corners), layout.NORMALS.dtype)
+            if mesh.normals is not None:
+                for corner, name in enumerate(("n0", "n1", "n2")):
+                    record[name] = _world_normals(mesh.normals, linear)[mesh.triangles[:, corner]]
+            normals.append(record)
+        if mapped:
+            record = np.zeros(len(corners), layout.UVS.dtype)
+            if mesh.uvs is not None:
+                for corner, name in enumerate(("uv0", "uv1", "uv2")):
+                    record[name] = mesh.uvs[mesh.triangles[:, corner]]
+            uvs.append(record)
+
+    def joined(parts: list[np.ndarray], dtype: np.dtype, width: tuple[int, ...] = ()) -> np.ndarray:
+        return np.concatenate(parts) if parts else np.zeros((0, *width), dtype)
+
+    points = joined(positions, np.dtype(np.float32), (9,))
+    finite = points[np.isfinite(points).all(axis=1)].reshape(-1, 3).astype(np.float64)
+    low, high = (finite.min(axis=0), finite.max(axis=0)) if len(finite) else (np.zeros(3), np.zeros(3))
+    return Geometry(
+        points,
+        joined(surfaces, layout.SURFACE.dtype),
+        joined(normals, layout.NORMALS.dtype) if smooth else None,
+        joined(uvs, layout.UVS.dtype) if mapped else None,
+        (low + high) / 2,
+        float(np.linalg.norm(high - low)) / 2,
+    )
+
+
+def _world_normals(normals: np.ndarray, linear: np.ndarray) -> np.ndarray:
+    """Return unit normals under ``linear``; zero where they have no direction."""
+    # The cofactor matrix is the inverse transpose up to scale, and exists for singular transforms too.
+    cofactor = np.stack(
+        [np.cross(linear[1], linear[2]), np.cross(linear[2], linear[0]), np.cross(linear[0], linear[1])]
+    )
+    if np.linalg.det(linear) < 0:
+        cofactor = -cofactor
+    with np.errstate(all="ignore"):
+        world = normals @ cofactor.T
+        length = np.linalg.norm(world, axis=1, keepdims=True)
+        unit = world / length
+    unit[~np.isfinite(unit).all(axis=1)] = 0.0
+    return unit.astype(np.float32)
+
+
+def is_cut_out(material: Material) -> bool:
+    """Return whether hits on ``material`` must look up its alpha."""
+    if material.alpha_mode != "mask":
+        return False
+    return material.base_color_texture >= 0 or material.alpha < material.alpha_cutoff
+
+
+def emits(material: Material) -> bool:
+    """Return whether ``material`` is a light."""
+    return max(material.emission) > 0.0
+
+
+def material_table(materials: tuple[Material, ...]) -> np.ndarray:
+    """Return ``(n,)`` layout.MATERIAL."""
+    table = np.zeros(len(materials), layout.MATERIAL.dtype)
+    none = layout.CONSTANT["NO_TEXTURE"]
+    for row, material in zip(table, materials, strict=True):
+        # An index of exactly 1 has no boundary to bend at: the half vector would vanish.
+        ior = material.ior if abs(material.ior - 1.0) > 1e-3 else 1.001
+        row["base_color"] = material.base_color
+        row["metallic"] = material.metallic
+        row["emission"] = material.emission
+        row["alpha_ggx"] = material.roughness**2
+        row["f0"] = ((material.ior - 1) / (material.ior + 1)) ** 2 * material.specular
+        row["specular"] = material.specular
+        row["ior"] = ior
+        row["transmission"] = material.transmission
+        row["base_color_texture"] = material.base_color_texture if material.base_color_texture >= 0 else none
+        row["emission_texture"] = material.emission_texture if material.emission_texture >= 0 else none
+        flags = layout.CONSTANT["MATERIAL_TWO_SIDED_EMISSION"] if material.double_sided else 0
+        if is_cut_out(material):
+            flags |= layout.CONSTANT["MATERIAL_ALPHA_MASK"]
+        row["flags"] = flags
+        row["alpha_cutoff"] = material.alpha_cutoff / material.alpha if material.alpha > 0 else np.inf
+    return table
+
+
+def srgb_to_linear() -> np.ndarray:
+    """Return ``(256,)`` float32: the linear value of each 8-bit sRGB code (IEC 61966-2-1)."""
+    code = np.arange(256) / 255.0
+    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def texture_tables(textures: tuple[Texture, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``(n,)`` layout.TEXTURE and all texels, ``(m, 4)`` uint8."""
+    table = np.zeros(max(len(textures), 1), layout.TEXTURE.dtype)
+    table["width"] = table["height"] = 1
+    bits = {"clamp": ("TEXTURE_CLAMP_U", "TEXTURE_CLAMP_V"), "mirror": ("TEXTURE_MIRROR_U", "TEXTURE_MIRROR_V")}
+    texels, offset = [], 0
+    for row, texture in zip(table, textures, strict=False):
+        height, width = texture.pixels.shape[:2]
+        flags = 0
+        for axis, wrap in enumerate(texture.wrap):
+            if wrap in bits:
+                flags |= layout.CONSTANT[bits[wrap][axis]]
+        if texture.filter == "nearest":
+            flags |= layout.CONSTANT["TEXTURE_NEAREST"]
+        if texture.srgb:
+            flags |= layout.CONSTANT["TEXTURE_SRGB"]
+        row["offset"], row["width"], row["height"], row["flags"] = offset, width, height, flags
+        texels.append(texture.pixels.reshape(-1, 4))
+        offset += width * height
+    return table, np.concatenate(texels) if texels else np.full((1, 4), 255, np.uint8)
+
+
+def alias_table(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a table that draws index ``i`` with chance ``weights[i] / sum(weights)``.
+
+    To draw: take a slot ``i`` uniformly and ``u`` in [0, 1), then keep ``i`` if ``u < keep[i]`` and
+    take ``other[i]`` if not.
+
+    Args:
+        weights: ``(n,)``, finite, none negative, not all zero.
+
+    Returns:
+        ``keep``, ``(n,)`` float32 in [0, 1], and ``other``, ``(n,)`` uint32.
+
+    Source: the sweep of Huebschle-Schneider, Sanders, "Parallel Weighted Random Sampling", 2019,
+    section 4.2, with its two running positions found by search in the running sums.
+    """
+    weights = np.asarray(weights, np.float64)
+    scaled = weights * (len(weights) / weights.sum())
+    keep = np.ones(len(weights))
+    other = np.arange(len(weights), dtype=np.uint32)
+    light = np.flatnonzero(scaled < 1.0)
+    heavy = np.flatnonzero(scaled >= 1.0)
+    lack = np.cumsum(1.0 - scaled[light])
+    excess = np.cumsum(scaled[heavy] - 1.0)
+    # A light slot is filled up by the heavy one that still has something left when its turn comes.
+    filler = np.searchsorted(excess, lack - (1.0 - scaled[light]), side="left")
+    keep[light] = scaled[light]
+    other[light] = heavy[np.minimum(filler, len(heavy) - 1)]
+    # A heavy slot that gave too much is filled up by the next heavy one.
+    emptied = np.searchsorted(lack, excess, side="right")
+    gave = emptied < len(lack)
+    gave[-1:] = False
+    keep[heavy[gave]] = 1.0 + excess[gave] - lack[emptied[gave]]
+    other[heavy[:-1]] = heavy[1:]
+    return np.clip(keep, 0.0, 1.0).astype(np.float32), other
+
+
+def light_table(scene: Scene, geometry: Geometry, sampling: str) -> tuple[np.ndarray, float]:
+    """Return ``(n,)`` layout.LIGHT and the environment's chance; sets ``geometry.surfaces["light"]``.
+
+    Entries are the emitting triangles (those with an area), the environment, the punctual lights.
+
+    Args:
+        sampling: ``"power"`` or ``"uniform"``, what the chances follow.
+    """
+    glow = np.array([emits(material) for material in scene.materials], bool)
+    sided = np.array([2.0 if material.double_sided else 1.0 for material in scene.materials])
+    radiance = np.array([_mean_emission(scene, material) @ LUMINANCE for material in scene.materials])
+    material = geometry.surfaces["material"]
+    triangles = np.flatnonzero(glow[material])
+    with np.errstate(all="ignore"):
+        cross = np.cross(
+            geometry.surfaces["e1"][triangles].astype(np.float64),
+            geometry.surfaces["e2"][triangles].astype(np.float64),
+        )
+        area = 0.5 * np.linalg.norm(cross, axis=1)
+    # float32 tells the areas of these on the device; smaller ones have none there.
+    sound = np.isfinite(area) & (area > 1e-30) & np.isfinite(geometry.positions[triangles]).all(axis=1)
+    triangles, area = triangles[sound], area[sound]
+
+    sky = has_environment(scene.environment)
+    punctual = [light for light in scene.lights if max(light.intensity) > 0.0]
+    table = np.zeros(len(triangles) + sky + len(punctual), layout.LIGHT.dtype)
+    power = np.zeros(len(table))
+    far = np.zeros(len(table), bool)
+    table["kind"][: len(triangles)] = layout.CONSTANT["LIGHT_TRIANGLE"]
+    table["triangle"][: len(triangles)] = triangles
+    geometry.surfaces["light"][triangles] = np.arange(len(triangles))
+    of = material[triangles]
+    power[: len(triangles)] = area * radiance[of] * sided[of] * math.pi
+    # A texture may be black on average and still glow somewhere.
+    power[: len(triangles)] = np.maximum(power[: len(triangles)], power.max(initial=0.0) * 1e-6)
+
+    at = len(triangles)
+    radius = max(geometry.radius, 1e-30)
+    if sky:
+        table["kind"][at] = layout.CONSTANT["LIGHT_ENVIRONMENT"]
+        mean = _environment_mean(scene.environment) @ LUMINANCE
+        power[at] = 4.0 * math.pi * mean * math.pi * radius**2
+        far[at] = True
+        at += 1
+    for light in punctual:
+        _fill_punctual(table[at], light)
+        strength = float(np.asarray(light.intensity) @ LUMINANCE)
+        if light.kind == "directional":
+            power[at] = strength * math.pi * radius**2
+            far[at] = True
+        elif light.kind == "point":
+            power[at] = strength * 4.0 * math.pi
+        else:
+            power[at] = strength * 2.0 * math.pi * (1.0 - math.cos(light.outer_angle))
+        at += 1
+
+    if not len(table):
+        return table, 0.0
+    if sampling == "uniform" or not power.sum() > 0.0:
+        chance = np.full(len(table), 1.0 / len(table))
+    else:
+        chance = power / power.sum()
+        share = chance[far].sum()
+        if 1.0 - NEAR_SHARE < share < 1.0:
+            chance[far] *= (1.0 - NEAR_SHARE) / share
+            chance[~far] *= NEAR_SHARE / (1.0 - share)
+    table["pmf"] = chance
+    table["keep"], table["other"] = alias_table(chance)
+    return table, float(chance[len(triangles)]) if sky else 0.0
+
+
+def _fill_punctual(row: np.void, light: Light) -> None:
+    kinds = {"point": "LIGHT_POINT", "spot": "LIGHT_SPOT", "directional": "LIGHT_DIRECTIONAL"}
+    row["kind"] = layout.CONSTANT[kinds[light.kind]]
+    row["position"] = light.position
+    row["direction"] = light.direction
+    row["range"] = light.range
+    row["intensity"] = light.intensity
+    row["cos_outer"] = math.cos(light.outer_angle)
+    row["spot_scale"] = 1.0 / max(math.cos(light.inner_angle) - math.cos(light.outer_angle), 1e-3)
+
+
+def _mean_emission(scene: Scene, material: Material) -> np.ndarray:
+    emission = np.asarray(material.emission, np.float64)
+    if not emits(material) or material.emission_texture < 0:
+        return emission
+    texture = scene.textures[material.emission_texture]
+    colors = texture.pixels[..., :3].reshape(-1, 3)
+    linear = srgb_to_linear()[colors] if texture.srgb else colors / 255.0
+    return emission * linear.mean(axis=0)
+
+
+def has_environment(environment: Environment) -> bool:
+    """Return whether any light comes from infinitely far away."""
+    if max(environment.radiance) <= 0.0:
+        return False
+    return environment.image is None or bool((environment.image > 0.0).any())
+
+
+def _environment_weights(image: np.ndarray) -> np.ndarray:
+    """Return the solid angle of each row of a lat-long image, ``(h, 1)``; sums to 4 pi over all texels."""
+    height, width = image.shape[:2]
+    edges = np.cos(np.pi * np.arange(height + 1) / height)
+    return ((edges[:-1] - edges[1:]) * (2.0 * np.pi / width))[:, None]
+
+
+def _environment_mean(environment: Environment) -> np.ndarray:
+    factor = np.asarray(environment.radiance, np.float64)
+    if environment.image is None:
+        return factor
+    weights = _environment_weights(environment.image)[..., None]
+    return factor * (environment.image * weights).sum(axis=(0, 1)) / (4.0 * np.pi)
+
+
+def environment_cells(environment: Environment) -> np.ndarray:
+    """Return ``(h * w,)`` layout.ENVIRONMENT_CELL.
+
+    Chances follow what bilinear look-ups return in a cell: its texel and parts of its neighbours, so
+    that no direction with light has none.
+    """
+    image = environment.image
+    if image is None:
+        return np.zeros(1, layout.ENVIRONMENT_CELL.dtype)
+    height, width = image.shape[:2]
+    cells = np.zeros(height * width, layout.ENVIRONMENT_CELL.dtype)
+    cells["radiance"] = image.reshape(-1, 3)
+    level = image.astype(np.float64) @ LUMINANCE
+    columns = (np.roll(level, 1, axis=1) + 6.0 * level + np.roll(level, -1, axis=1)) / 8.0
+    padded = np.concatenate([columns[:1], columns, columns[-1:]])
+    smooth = (padded[:-2] + 6.0 * padded[1:-1] + padded[2:]) / 8.0
+    weights = (smooth * _environment_weights(image)).ravel()
+    cells["pmf"] = weights / weights.sum()
+    cells["keep"], cells["other"] = alias_table(weights)
+    return cells
+
+
+def pixel_order(x: int, y: int, width: int, height: int) -> np.ndarray:
+    """Return the pixels of a crop as ``row << 16 | column``, ``(width * height,)`` uint32.
+
+    Along a Morton curve, so that the lanes of a block, and the slots in flight, see neighbours.
+    """
+    columns, rows = np.meshgrid(np.arange(width, dtype=np.uint64), np.arange(height, dtype=np.uint64))
+
+    def spread(v: np.ndarray) -> np.ndarray:
+        v = (v | (v << 8)) & 0x00FF00FF
+        v = (v | (v << 4)) & 0x0F0F0F0F
+        v = (v | (v << 2)) & 0x33333333
+        return (v | (v << 1)) & 0x55555555
+
+    code = spread(columns.ravel()) | (spread(rows.ravel()) << np.uint64(1))
+    order = np.argsort(code, kind="stable")
+    return (((rows.ravel() + np.uint64(y)) << np.uint64(16)) | (columns.ravel() + np.uint64(x)))[order].astype(
+        np.uint32
+    )
+
+
+def camera_values(camera: Camera, width: int, height: int) -> dict[str, object]:
+    """Return the camera's fields of layout.PARAMS."""
+    matrix = camera.transform
+    scale_y = math.tan(camera.fov_y / 2)
+    if not (np.isfinite(matrix).all() and math.isfinite(scale_y) and scale_y > 0):
+        raise InputError(f"camera {camera.name!r}: expected a finite position and a field of view below 180")
+    return {
+        "camera_origin": matrix[:3, 3],
+        "camera_right": matrix[:3, 0],
+        "camera_up": matrix[:3, 1],
+        "camera_forward": -matrix[:3, 2],
+        "lens_radius": camera.lens_radius,
+        "focus_distance": camera.focus_distance,
+        "film_scale_x": scale_y * width / height,
+        "film_scale_y": scale_y,
+    }

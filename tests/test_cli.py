@@ -1,0 +1,484 @@
+"""The command line: exit codes, one line an error, and nothing rendered that cannot be written."""
+
+import contextlib
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import types
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from psf_cl.cli.main import main
+from psf_cl.cli.progress import describe, seconds_left
+from psf_cl.errors import DeviceError
+from psf_cl.image import Image, read_exr, write_exr
+from psf_cl.scene.model import Scene
+from psf_cl.settings import Settings
+
+
+@dataclasses.dataclass
+class Progress:
+    passes: int
+    spp_target: int | None
+    seconds: float
+    seconds_target: float | None
+    samples_per_second: float
+
+
+class FakeRenderer:
+    """Adds 1 / 4 s a pass; pass n makes a picture of 1 + 1 / n.  Class attributes steer it."""
+
+    made: ClassVar[dict] = {}
+    on_pass = staticmethod(lambda passes: None)
+    build_error: BaseException | None = None
+    value = 1.0
+
+    def __init__(self, scene, settings, device=None, outputs=frozenset(), crop=None):
+        type(self).made = {"settings": settings, "outputs": outputs, "crop": crop, "device": device}
+        if self.build_error is not None:
+            raise self.build_error
+        self.x, self.y, self.width, self.height = crop or (0, 0, scene.width, scene.height)
+        self.scene, self.passes, self.outside = scene, 0, 0
+        self.closed = False
+        type(self).made["renderer"] = self
+
+    def render(self, spp=None, seconds=None, progress=None):
+        type(self).made |= {"spp": spp, "seconds": seconds}
+        while True:
+            self.passes += 1
+            self.on_pass(self.passes)
+            time = self.passes * 0.25
+            if not progress(Progress(self.passes, spp, time, seconds, 1e6)):
+                return
+            if self.passes == spp or (seconds is not None and time >= seconds):
+                return
+
+    @contextlib.contextmanager
+    def outside_time(self):
+        self.outside += 1
+        yield
+
+    def snapshot(self, names=("rgb",)):
+        rgb = np.full((self.height, self.width, 3), self.value + 1.0 / self.passes, np.float32)
+        place = (self.x, self.y, self.scene.width, self.scene.height)
+        return Image({"rgb": rgb}, {}, *place)
+
+    def image(self):
+        return self.snapshot()
+
+    def stats(self):
+        return {
+            "spp": self.passes,
+            "render_seconds": self.passes * 0.25,
+            "seed": 0,
+            "settings": {},
+        }
+
+    def close(self):
+        self.closed = True
+
+
+@pytest.fixture
+def fake(monkeypatch, tmp_path):
+    """Work in an empty folder, with a scene of 8 x 6 pixels and a renderer that needs no device."""
+
+    class Renderer(FakeRenderer):
+        pass
+
+    def load_scene(path, environment=None, camera=None, size=None):
+        width, height = size or (8, 6)
+        return Scene(path, width, height, render={"max_depth": 3}, notes=("a note",))
+
+    def module(name, **members):
+        made = types.ModuleType(name)
+        vars(made).update(members)
+        monkeypatch.setitem(sys.modules, name, made)
+
+    module("psf_cl.renderer", Renderer=Renderer)
+    module("psf_cl.device.device", open_device=lambda name: f"device {name}")
+    module("psf_cl.scene.load", load_scene=load_scene)
+    monkeypatch.chdir(tmp_path)
+    return Renderer
+
+
+def files_in(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def constant(path, value, width=8, height=6):
+    write_exr(path, Image({"rgb": np.full((height, width, 3), value, np.float32)}))
+
+
+def one_error(captured):
+    """Return the only line on standard error, checked for being one of ours."""
+    assert captured.out == ""
+    assert captured.err.startswith("psf-cl: error: ") and captured.err.count("\n") == 1
+    return captured.err
+
+
+def test_render_writes_both_pictures_and_one_summary_line(fake, tmp_path, capsys):
+    assert main(["render", "some/box.toml"]) == 0
+    assert files_in(tmp_path) == ["box.exr", "box.png"]
+    assert (fake.made["spp"], fake.made["seconds"]) == (64, None)
+    assert fake.made["settings"] == Settings(max_depth=3)
+    assert fake.made["renderer"].closed
+    captured = capsys.readouterr()
+    assert captured.out == "box.exr: 64 spp in 16.00 s, 0.00 Msamples/s\n"
+    assert captured.err.startswith("note: a note\n") and "rendering: " in captured.err
+    assert read_exr("box.exr").stats["scene"] == "some/box.toml"
+
+
+def test_options_reach_the_renderer(fake, tmp_path, capsys):
+    arguments = "render a.glb -o x.exr --seconds 0.7 --set max_depth=4 sampler=random --seed 5"
+    arguments += " --set roulette_depth=2 --size 20x10 --crop 5,2,8,6 --aov depth,normal"
+    arguments += " --device pocl --half --stats s.json --quiet"
+    assert main(arguments.split()) == 0
+    assert capsys.readouterr() == ("", "")
+    made = fake.made
+    assert made["settings"] == Settings(max_depth=4, sampler="random", seed=5, roulette_depth=2)
+    assert made["outputs"] == {"depth", "normal"} and made["crop"] == (5, 2, 8, 6)
+    assert made["device"] == "device pocl" and (made["spp"], made["seconds"]) == (None, 0.7)
+    assert files_in(tmp_path) == ["s.json", "x.exr", "x.png"]
+    stats = json.loads((tmp_path / "s.json").read_text())
+    assert stats["spp"] == 3 and "error" not in stats
+    image = read_exr("x.exr")
+    assert (image.x, image.y, image.full_width, image.full_height) == (5, 2, 20, 10)
+
+
+def test_errors_are_measured_at_the_first_pass_at_powers_of_two_and_at_the_end(fake, capsys):
+    constant("ref.exr", 1.0)
+    arguments = "render a.toml --spp 23 --reference ref.exr --stats s.json"
+    assert main(arguments.split()) == 0
+    with open("s.json") as file:
+        points = json.load(file)["error"]
+    assert [point["spp"] for point in points] == [1, 4, 8, 16, 23]
+    assert [point["seconds"] for point in points] == [0.25, 1.0, 2.0, 4.0, 5.75]
+    for point in points:
+        assert point["mse"] == pytest.approx(point["spp"] ** -2.0, rel=1e-5)
+        assert point["relmse"] == pytest.approx(point["spp"] ** -2.0 / 1.01, rel=1e-5)
+        assert "relmse_trimmed" in point
+    assert fake.made["renderer"].outside == 4  # The last point is the finished image.
+    assert "relMSE 0.001872" in capsys.readouterr().out
+
+
+def test_a_full_reference_serves_a_crop(fake):
+    rgb = np.zeros((6, 8, 3), np.float32)
+    rgb[2:4, 3:5] = 1.0
+    write_exr("ref.exr", Image({"rgb": rgb}))
+    arguments = "render a.toml --spp 1 --crop 3,2,2,2 --reference ref.exr --stats s.json"
+    assert main(arguments.split()) == 0
+    with open("s.json") as file:
+        assert [point["mse"] for point in json.load(file)["error"]] == [1.0]
+
+
+def test_pixels_that_are_not_finite_stay_valid_json_and_are_said(fake, capsys):
+    constant("ref.exr", 1.0)
+    fake.value = np.nan
+    assert main("render a.toml --spp 1 --reference ref.exr --stats s.json".split()) == 0
+    with open("s.json") as file:
+        point = json.load(file)["error"][0]
+    assert point["nonfinite"] == 48 and point["mse"] is None
+    assert "48 pixels not finite" in capsys.readouterr().out
+
+
+BAD_USAGE = {
+    "": "required",
+    "paint a.toml": "paint",
+    "render": "SCENE",
+    "render a.toml b.toml": "b.toml",
+    "render a.toml --spp 0": "--spp",
+    "render a.toml --spp 1.5": "--spp",
+    "render a.toml --spp 99999999999": "--spp",
+    "render a.toml --seconds 0": "--seconds",
+    "render a.toml --seconds nan": "--seconds",
+    "render a.toml --seconds inf": "--seconds",
+    "render a.toml --spp 4 --seconds 2": "not allowed with",
+    "render a.toml --noise 0.1": "--noise",
+    "render a.toml --size 0x5": "--size",
+    "render a.toml --size 5": "--size",
+    "render a.toml --crop 0,0,5": "--crop",
+    "render a.toml --crop 0,0,0,5": "--crop",
+    "render a.toml --crop -1,0,5,5": "--crop",
+    "render a.toml --crop 4,0,5,5": "leaves the picture, 8x6",
+    "render a.toml --exposure big": "--exposure",
+    "render a.toml --set max_depth": "key=value",
+    "render --set max_depth=1 a.toml": "before --set",
+    "render a.toml --set max_dept=1": "did you mean max_depth",
+    "render a.toml --set max_depth=-1": "max_depth",
+    "render a.toml --seed -1": "seed",
+    "render a.toml --seed x": "seed",
+    "render a.toml --preset none": "preset",
+    "render a.toml --aov depth,hue": "hue",
+    "render a.toml -o a.png": ".exr",
+    "render a.toml -o none/a.exr": "cannot write: there is no folder",
+    "render a.toml -o file/a.exr": "cannot write: Not a directory",
+    "render a.toml --stats none/a.json": "cannot write",
+    "render a.toml --stats a.png": "another input or output",
+    "render a.toml -o small.exr --reference small.exr": "another input or output",
+    "render a.toml --reference none.exr": "none.exr: cannot read",
+    "render a.toml --reference file": "expected an OpenEXR image",
+    "render a.toml --reference small.exr": "small.exr: expected 8x6 pixels; got 4x4",
+    "render a.toml --reference black.exr": "black.exr: the reference is black",
+    "compare small.exr": "B.exr",
+    "compare small.exr none.exr": "none.exr: cannot read",
+    "compare small.exr black.exr": "black.exr: expected 4x4 pixels; got 8x6",
+    "compare small.exr small.exr --blocks 9": "1 to 4 blocks",
+    "compare small.exr small.exr --blocks 0": "--blocks",
+    "compare small.exr small.exr --difference none/d.png": "cannot write",
+}
+
+
+@pytest.mark.parametrize("arguments", BAD_USAGE)
+def test_bad_input_is_one_line_exit_code_2_and_no_file(fake, tmp_path, capsys, arguments):
+    (tmp_path / "file").touch()
+    constant("small.exr", 1.0, 4, 4)
+    constant("black.exr", 0.0)
+    before = files_in(tmp_path)
+    assert main(arguments.split()) == 2
+    error = one_error(capsys.readouterr())
+    assert BAD_USAGE[arguments] in error
+    assert files_in(tmp_path) == before
+    assert fake.made == {}, "the renderer was built before everything was checked"
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "text"),
+    [
+        (DeviceError("no such\ndevice"), 1, "no such device"),
+        (MemoryError(), 1, "out of memory"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+    ],
+)
+def test_failures_of_the_run_have_their_own_codes(fake, tmp_path, capsys, error, code, text):
+    fake.build_error = error
+    assert main(["render", "a.toml", "--quiet"]) == code
+    assert text in one_error(capsys.readouterr())
+    assert files_in(tmp_path) == []
+
+
+def test_a_missing_pyopencl_is_one_line(fake, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "psf_cl.device.device", None)
+    assert main(["render", "a.toml", "--quiet"]) == 1
+    assert "psf-cl doctor" in one_error(capsys.readouterr())
+
+
+def test_the_first_ctrl_c_keeps_what_is_rendered(fake, tmp_path, capsys):
+    def press(passes):
+        if passes == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    fake.on_pass = staticmethod(press)
+    before = signal.getsignal(signal.SIGINT)
+    assert main("render a.toml --spp 1000 --stats s.json".split()) == 130
+    assert signal.getsignal(signal.SIGINT) is before
+    assert files_in(tmp_path) == ["a.exr", "a.png", "s.json"]
+    assert read_exr("a.exr").stats["spp"] == 3
+    captured = capsys.readouterr()
+    assert captured.out.startswith("a.exr: 3 spp") and "interrupted" in captured.err
+
+
+def test_the_second_ctrl_c_stops_at_once_and_writes_nothing(fake, tmp_path, capsys):
+    def press(passes):
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+    fake.on_pass = staticmethod(press)
+    assert main(["render", "a.toml", "--quiet"]) == 130
+    assert "interrupted" in one_error(capsys.readouterr())
+    assert files_in(tmp_path) == [] and fake.made["renderer"].closed
+
+
+def test_interrupted_before_the_first_pass_writes_nothing(fake, tmp_path, monkeypatch, capsys):
+    def render(self, spp=None, seconds=None, progress=None):
+        signal.raise_signal(signal.SIGINT)
+        assert not progress(Progress(0, spp, 0.0, seconds, 0.0))
+
+    fake.render = render
+    assert main(["render", "a.toml", "--quiet"]) == 130
+    assert files_in(tmp_path) == []
+
+
+def test_plan_prints_reasons_and_sums_and_json(fake, monkeypatch, capsys):
+    buffer = types.SimpleNamespace(name="paths", bytes=3 << 20, what="path state [x]")
+    stages = [
+        types.SimpleNamespace(
+            name="shade",
+            planned=True,
+            reason="always",
+            kernels=("shade_surface",),
+            buffers=(buffer,),
+        ),
+        types.SimpleNamespace(
+            name="masks", planned=False, reason="no alpha", kernels=(), buffers=(buffer,)
+        ),
+    ]
+    plan = types.SimpleNamespace(
+        stages=stages,
+        features={"ALPHA": False, "LANES": 16},
+        left_out=[("textures", "the scene has none")],
+        total_bytes=3 << 20,
+        as_dict=lambda: {"total_bytes": 3 << 20},
+    )
+    seen = {}
+
+    def make_plan(scene, settings, outputs, device, crop):
+        seen.update(outputs=outputs, device=device, crop=crop, settings=settings)
+        return plan
+
+    module = types.ModuleType("psf_cl.plan")
+    module.make_plan = make_plan
+    monkeypatch.setitem(sys.modules, "psf_cl.plan", module)
+    assert main("plan a.toml --aov depth --crop 1,1,2,2 --set max_depth=9".split()) == 0
+    assert seen == {
+        "outputs": {"depth"},
+        "device": None,
+        "crop": (1, 1, 2, 2),
+        "settings": Settings(max_depth=9),
+    }
+    out = capsys.readouterr().out
+    for text in ("shade_surface", "always", "no alpha", "LANES", "16", "textures", "has none"):
+        assert text in out
+    assert "path state [x]" in out and "3.0 MiB" in out
+    assert out.count("3,145,728") == 2  # The buffer and the sum, but not what is left out.
+    assert main("plan a.toml --json".split()) == 0
+    assert json.loads(capsys.readouterr().out) == {"total_bytes": 3 << 20}
+
+
+@dataclasses.dataclass
+class Report:
+    platform: str = "Some platform"
+    device: str = "Some device"
+    driver: str = "1.0"
+    ok: bool = True
+    reason: str = ""
+    seconds: float = 0.5
+
+
+@pytest.mark.parametrize(
+    ("reports", "code", "texts"),
+    [
+        ([Report()], 0, ["passed in 0.50 s", "1 of 1 devices can be used"]),
+        (
+            [Report(), Report(ok=False, reason="wrong results: atomic adds")],
+            0,
+            ["1 of 2", "fix: do not render on it"],
+        ),
+        (
+            [Report(ok=False, reason="the driver crashed (SIGILL)")],
+            1,
+            ["SIGILL", "fix: the driver is broken", "no OpenCL device can be used"],
+        ),
+        ([], 1, ["no OpenCL device can be used", "fix: install"]),
+        (DeviceError("OpenCL does not start: No module named 'pyopencl'"), 1, ["pip install"]),
+    ],
+)
+def test_doctor_says_what_works_and_how_to_fix_the_rest(monkeypatch, capsys, reports, code, texts):
+    def probe_devices():
+        if isinstance(reports, DeviceError):
+            raise reports
+        return reports
+
+    module = types.ModuleType("psf_cl.device.selftest")
+    module.probe_devices = probe_devices
+    monkeypatch.setitem(sys.modules, "psf_cl.device.selftest", module)
+    assert main(["doctor"]) == code
+    out = capsys.readouterr().out
+    for text in ["numpy", "OpenEXR", *texts]:
+        assert text in out
+
+
+def test_compare_prints_metrics_and_judges_by_the_limit(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    constant("a.exr", 1.5)
+    constant("b.exr", 1.0)
+    assert main("compare a.exr b.exr".split()) == 0
+    out = capsys.readouterr().out
+    assert "0.25" in out and "relmse_trimmed" in out and "mae" in out
+    assert main("compare a.exr b.exr --max-relmse 0.25".split()) == 0
+    assert main("compare a.exr b.exr --max-relmse 0.24".split()) == 1
+    assert "FAILED: relMSE above 0.24" in capsys.readouterr().out
+
+
+def test_compare_fails_on_pixels_that_are_not_finite(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    rgb = np.ones((6, 8, 3), np.float32)
+    write_exr("b.exr", Image({"rgb": rgb}))
+    rgb[0, 0, 0] = np.nan
+    write_exr("a.exr", Image({"rgb": rgb}))
+    assert main("compare a.exr b.exr --max-relmse 1 --blocks 4 --difference d.png".split()) == 1
+    assert "not finite" in capsys.readouterr().out
+
+
+def test_compare_shows_the_sign_of_the_difference(tmp_path, monkeypatch):
+    import PIL.Image
+
+    monkeypatch.chdir(tmp_path)
+    rgb = np.ones((1, 4, 3), np.float32)
+    write_exr("b.exr", Image({"rgb": rgb}))
+    rgb[0] *= np.array([[1.0], [9.0], [0.1], [np.inf]], np.float32)
+    write_exr("a.exr", Image({"rgb": rgb}))
+    assert main("compare a.exr b.exr --difference d.png".split()) == 1
+    with PIL.Image.open("d.png") as png:
+        pixels = np.asarray(png)[0].tolist()
+    assert pixels == [[255, 255, 255], [255, 0, 0], [0, 0, 255], [0, 255, 0]]
+
+
+def test_compare_of_two_resolutions_gives_blocks_only(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    constant("a.exr", 1.1, 16, 8)
+    constant("b.exr", 1.0, 8, 4)
+    assert main("compare a.exr b.exr --blocks 4".split()) == 0
+    out = capsys.readouterr().out
+    assert "100.0 %" in out and "1.10000" in out and "mse" not in out
+    assert main("compare a.exr b.exr --blocks 4 --max-relmse 1".split()) == 2
+
+
+def test_progress_is_told_in_words():
+    by_spp = Progress(16, 64, 2.0, None, 2.5e6)
+    assert describe(by_spp) == "16/64 spp, 2.0 s, 2.50 Msamples/s, 6 s left"
+    by_time = Progress(16, None, 2.0, 4000.0, 2.5e6)
+    assert describe(by_time) == "16 spp, 2.0/4000 s, 2.50 Msamples/s, 1:06:38 h left"
+    assert seconds_left(Progress(0, 64, 2.0, None, 0.0)) is None
+    assert seconds_left(Progress(9, None, 5.0, 4.0, 0.0)) == 0.0
+
+
+def run(*arguments, **options):
+    command = [sys.executable, "-m", "psf_cl", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+
+
+def test_the_program_ends_without_a_traceback(tmp_path):
+    missing = run("render", str(tmp_path / "no.toml"), "-o", str(tmp_path / "a.exr"))
+    assert missing.returncode == 2 and missing.stdout == ""
+    assert missing.stderr.count("\n") == 1 and "no.toml" in missing.stderr
+    help_text = run("render", "--help")
+    assert help_text.returncode == 0 and "default 64" in help_text.stdout
+    assert "max_depth" in help_text.stdout
+
+
+def test_help_imports_nothing_heavy():
+    script = (
+        "import sys\nfrom psf_cl.cli.main import main\n"
+        "try: main(['render', '--help'])\nexcept SystemExit: pass\n"
+        "heavy = {'numpy', 'pyopencl', 'OpenEXR', 'PIL', 'rich', 'trimesh'} & set(sys.modules)\n"
+        "sys.exit(', '.join(sorted(heavy)) or 0)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_closed_pipe_is_no_error(tmp_path):
+    constant(tmp_path / "a.exr", 1.0)
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    command = [sys.executable, "-m", "psf_cl", "compare", *[str(tmp_path / "a.exr")] * 2]
+    done = subprocess.run(command, stdout=write_end, stderr=subprocess.PIPE, check=False)
+    os.close(write_end)
+    assert (done.returncode, done.stderr) == (0, b"")

@@ -1,0 +1,134 @@
+"""Set-up: the self-test tells working devices from broken ones, and advice fits the system."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+from psf_cl.device import selftest
+from psf_cl.device.advice import driver_command
+from psf_cl.errors import DeviceError
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def set_up():
+    spec = importlib.util.spec_from_file_location("set_up", ROOT / "tools" / "set_up.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def fake_python(tmp_path, monkeypatch):
+    """Let the probe start a shell script: one device is listed, then ``answer`` runs."""
+
+    def install(answer: str, listing: str | None = None) -> None:
+        names = '{"platform": "P", "device": "D", "driver": "1"}'
+        script = tmp_path / "python"
+        script.write_text(
+            '#!/bin/sh\nif [ "$3" = --list ]; then\n'
+            + (listing or f"echo driver noise; echo '[[0, 0, {names}]]'")
+            + f"; exit; fi\n{answer}\n"
+        )
+        script.chmod(0o755)
+        monkeypatch.setattr(sys, "executable", str(script))
+
+    return install
+
+
+def test_the_device_of_the_tests_passes_in_a_process_of_its_own(device):
+    reports = selftest.probe_devices()
+    assert device.name in [f"{report.platform}: {report.device}" for report in reports if report.ok]
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "part"),
+    [
+        ("fma(v, v, (float16)(-1.0f))", "fma(v, v, (float16)(-1.0001f))", "vector arithmetic"),
+        ("w, v < 1.0f)", "w, v > 1.0f)", "vector arithmetic"),
+        ("atomic_add(&histogram[value % BINS], i)", "histogram[value % BINS] = i", "atomic adds"),
+        ("sums[l] += sums[l + step]", "sums[l] += 1u", "local memory"),
+    ],
+)
+def test_a_wrong_result_fails_the_self_test(device, monkeypatch, right, wrong, part):
+    assert right in selftest._SOURCE
+    monkeypatch.setattr(selftest, "_SOURCE", selftest._SOURCE.replace(right, wrong))
+    assert selftest.run_self_test(device.cl_device) == f"wrong results: {part}"
+
+
+def test_a_compiler_error_is_one_line(device, monkeypatch):
+    monkeypatch.setattr(selftest, "_SOURCE", selftest._SOURCE.replace("fma(", "no_such_function("))
+    reason = selftest.run_self_test(device.cl_device)
+    assert reason and "\n" not in reason
+
+
+def test_a_crashing_driver_is_reported(fake_python):
+    fake_python("kill -SEGV $$")
+    (report,) = selftest.probe_devices()
+    assert not report.ok
+    assert report.reason == "the driver crashed (SIGSEGV)"
+    assert (report.platform, report.device, report.driver) == ("P", "D", "1")
+
+
+def test_a_hanging_driver_is_reported(fake_python, monkeypatch):
+    monkeypatch.setattr(selftest, "PROBE_SECONDS", 1.0)
+    fake_python("exec sleep 60")
+    (report,) = selftest.probe_devices()
+    assert report.reason == "no answer within 1 s"
+
+
+def test_a_loader_that_crashes_is_a_device_error(fake_python):
+    fake_python("exit 0", listing="kill -SEGV $$")
+    with pytest.raises(DeviceError, match="OpenCL does not start: the driver crashed"):
+        selftest.probe_devices()
+
+
+def test_no_driver_gives_no_reports(monkeypatch, tmp_path):
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(tmp_path / "nothing"))
+    assert selftest.probe_devices() == []
+    assert selftest.main([]) == 1
+
+
+@pytest.mark.parametrize(
+    ("ids", "command"),
+    [
+        (["debian"], "apt-get install pocl-opencl-icd"),
+        (["linuxmint", "ubuntu", "debian"], "apt-get install pocl-opencl-icd"),
+        (["fedora"], "dnf install pocl"),
+        (["opensuse-leap", "suse", "opensuse"], "zypper install pocl"),
+        (["manjaro", "arch"], "pacman -S pocl"),
+        (["darwin"], "brew install pocl"),
+        (["nixos"], "conda-forge"),
+    ],
+)
+def test_the_advice_fits_the_system(ids, command):
+    assert command in driver_command(ids)
+
+
+def test_set_up_stops_with_the_command_where_it_may_install_nothing(set_up, monkeypatch, capsys):
+    monkeypatch.setenv("PSF_CL_NO_SYSTEM_INSTALL", "1")
+    monkeypatch.setattr(set_up, "working_device", lambda: ("", ["P: D: wrong results"]))
+    monkeypatch.setattr(set_up, "pip", lambda *arguments: 1)
+    monkeypatch.setattr(set_up, "run", lambda command: pytest.fail(f"ran {command}"))
+    monkeypatch.setattr("psf_cl.device.advice.system_ids", lambda: ["fedora"])
+    with pytest.raises(SystemExit) as stop:
+        set_up.ensure_device()
+    output = capsys.readouterr()
+    assert stop.value.code == 1
+    assert "P: D: wrong results" in output.out
+    assert "sudo dnf install pocl" in output.err
+
+
+def test_set_up_takes_a_wheel_that_does_not_work_away_again(set_up, monkeypatch):
+    done = []
+    monkeypatch.setenv("PSF_CL_NO_SYSTEM_INSTALL", "1")
+    monkeypatch.setattr(set_up, "working_device", lambda: ("", ["broken"]))
+    monkeypatch.setattr(set_up, "pip", lambda *arguments: done.append(arguments[0]) or 0)
+    with pytest.raises(SystemExit):
+        set_up.ensure_device()
+    assert done == ["install", "uninstall"]
