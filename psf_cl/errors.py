@@ -1,4 +1,4 @@
-"""The two errors that a user can meet; the command line turns them into one line and an exit code."""
+"""The two errors that a user can meet: one line each, and an exit code on the command line."""
 
 
 class InputError(Exception):

@@ -51,7 +51,9 @@ class Plan:
 
     @property
     def buffers(self) -> tuple[BufferSpec, ...]:
-        return self.scene_buffers + tuple(buffer for stage in self.stages for buffer in stage.buffers)
+        return self.scene_buffers + tuple(
+            buffer for stage in self.stages for buffer in stage.buffers
+        )
 
     @property
     def total_bytes(self) -> int:
@@ -60,7 +62,8 @@ class Plan:
     def defines(self, stage: StageSpec) -> dict[str, int]:
         """Return the macros to build ``stage`` with: what it does not depend on is 0."""
         return {
-            name: feature.value if name in stage.flags else 0 for name, feature in self.features.items()
+            name: feature.value if name in stage.flags else 0
+            for name, feature in self.features.items()
         }
 
     def as_dict(self) -> dict[str, Any]:
@@ -116,7 +119,14 @@ def make_plan(
         raise InputError(f"--aov: unknown {', '.join(unknown)}; known: {', '.join(AOVS)}")
     crop = crop or (0, 0, scene.width, scene.height)
     x, y, width, height = crop
-    if width < 1 or height < 1 or x < 0 or y < 0 or x + width > scene.width or y + height > scene.height:
+    if (
+        width < 1
+        or height < 1
+        or x < 0
+        or y < 0
+        or x + width > scene.width
+        or y + height > scene.height
+    ):
         raise InputError(
             f"--crop: {x},{y},{width},{height} is not inside the film of {scene.width}x{scene.height}"
         )
@@ -147,7 +157,9 @@ def make_plan(
             left_out.append((module.__name__.rsplit(".", 1)[-1], "the scene has no light"))
         else:
             stages.append(stage)
-    left_out += [(name.lower(), feature.reason) for name, feature in features.items() if not feature.value]
+    left_out += [
+        (name.lower(), feature.reason) for name, feature in features.items() if not feature.value
+    ]
     if len(used) < len(scene.materials):
         left_out.append(("materials", f"{len(scene.materials) - len(used)} are on no shape"))
     return Plan(
@@ -194,7 +206,9 @@ def _features(scene: Scene, outputs: frozenset[str]) -> dict[str, Feature]:
     return {
         "TEXTURES": switch(textured, "a material has a texture", "no material has a texture"),
         "ALPHA": switch(
-            any(is_cut_out(m) for m in materials), "a material is cut out by its alpha", "no material is cut out"
+            any(is_cut_out(m) for m in materials),
+            "a material is cut out by its alpha",
+            "no material is cut out",
         ),
         "SMOOTH": switch(
             any(shape.mesh.normals is not None for shape in scene.shapes),
@@ -208,18 +222,26 @@ def _features(scene: Scene, outputs: frozenset[str]) -> dict[str, Feature]:
         ),
         "AREA_LIGHTS": switch(any(emits(m) for m in materials), "a shape emits", "no shape emits"),
         "PUNCTUAL_LIGHTS": switch(
-            bool(lights), f"{len(lights)} lights without extent", "no point, spot or directional light"
+            bool(lights),
+            f"{len(lights)} lights without extent",
+            "no point, spot or directional light",
         ),
         "ENVIRONMENT": Feature(
             (2 if image else 1) if sky else 0,
-            ("an environment image" if image else "a constant sky") if sky else "the environment is black",
+            ("an environment image" if image else "a constant sky")
+            if sky
+            else "the environment is black",
         ),
         "LENS": switch(camera_lens, "the camera has a lens", "the camera is a pinhole"),
         "AOV_DIRECT": switch(
-            bool(outputs & {"direct", "indirect"}), "direct or indirect was asked for", "neither direct nor indirect was asked for"
+            bool(outputs & {"direct", "indirect"}),
+            "direct or indirect was asked for",
+            "neither direct nor indirect was asked for",
         ),
         "AOV_FEATURES": switch(
-            bool(feature_aovs), f"{', '.join(sorted(feature_aovs))} asked for", "no albedo, normal or depth was asked for"
+            bool(feature_aovs),
+            f"{', '.join(sorted(feature_aovs))} asked for",
+            "no albedo, normal or depth was asked for",
         ),
     }
 
@@ -227,7 +249,9 @@ def _features(scene: Scene, outputs: frozenset[str]) -> dict[str, Feature]:
 def _scene_buffers(context: Context, scene: Scene, used: set[int]) -> tuple[BufferSpec, ...]:
     triangles = context.triangle_count
     emitting = sum(
-        len(shape.mesh.triangles) for shape in scene.shapes if emits(scene.materials[shape.material])
+        len(shape.mesh.triangles)
+        for shape in scene.shapes
+        if emits(scene.materials[shape.material])
     )
     punctual = sum(max(light.intensity) > 0.0 for light in scene.lights)
     lights = emitting + punctual + bool(context.features["ENVIRONMENT"].value)
@@ -244,7 +268,9 @@ def _scene_buffers(context: Context, scene: Scene, used: set[int]) -> tuple[Buff
     if context.on("TEXTURES") or context.on("ALPHA"):
         buffers += [
             BufferSpec("uvs", layout.UVS.dtype, triangles, "texture coordinates"),
-            BufferSpec("textures", layout.TEXTURE.dtype, context.texture_count, "where textures lie"),
+            BufferSpec(
+                "textures", layout.TEXTURE.dtype, context.texture_count, "where textures lie"
+            ),
             BufferSpec("texels", uint8, 4 * context.texel_count, "texels of all textures"),
             BufferSpec("srgb_to_linear", float32, 256, "decoding table"),
         ]
@@ -253,7 +279,10 @@ def _scene_buffers(context: Context, scene: Scene, used: set[int]) -> tuple[Buff
     if context.features["ENVIRONMENT"].value == 2:
         buffers.append(
             BufferSpec(
-                "environment", layout.ENVIRONMENT_CELL.dtype, context.environment_count, "environment image"
+                "environment",
+                layout.ENVIRONMENT_CELL.dtype,
+                context.environment_count,
+                "environment image",
             )
         )
     return tuple(buffers)

@@ -145,7 +145,9 @@ class Renderer:
             if partial:
                 # Not one pass is complete: what is there of the first is all there is.
                 self.device.fill(self.buffers[name])
-                self._add_launch(ring, name, planes, partial=True)(planes * self.plan.pixel_count, film.GROUP)
+                self._add_launch(ring, name, planes, partial=True)(
+                    planes * self.plan.pixel_count, film.GROUP
+                )
             sums[name] = self.device.read(self.buffers[name]).reshape(planes, -1)
             if partial:
                 self.device.fill(self.buffers[name])
@@ -258,7 +260,9 @@ class Renderer:
         geometry = tables.flatten(scene)
         lights, environment_pmf = tables.light_table(scene, geometry, self.settings.light_sampling)
         textures, texels = tables.texture_tables(scene.textures if "textures" in planned else ())
-        uvs = geometry.uvs if geometry.uvs is not None else np.zeros(geometry.count, layout.UVS.dtype)
+        uvs = (
+            geometry.uvs if geometry.uvs is not None else np.zeros(geometry.count, layout.UVS.dtype)
+        )
         contents = {
             "params": lambda: self._params(geometry, len(lights), environment_pmf),
             "surfaces": lambda: geometry.surfaces,
@@ -276,11 +280,15 @@ class Renderer:
                 self.buffers[name] = self.device.upload(name, content())
         return geometry
 
-    def _params(self, geometry: tables.Geometry, light_count: int, environment_pmf: float) -> np.ndarray:
+    def _params(
+        self, geometry: tables.Geometry, light_count: int, environment_pmf: float
+    ) -> np.ndarray:
         scene, settings = self.scene, self.settings
         x, y, width, _ = self.plan.crop
         params = np.zeros(1, layout.PARAMS.dtype)
-        values: dict[str, Any] = tables.camera_values(scene.cameras[scene.camera], scene.width, scene.height)
+        values: dict[str, Any] = tables.camera_values(
+            scene.cameras[scene.camera], scene.width, scene.height
+        )
         image = scene.environment.image
         values |= {
             "width": scene.width,
@@ -293,7 +301,9 @@ class Renderer:
             "slots": self.plan.traits.slots,
             "seed": settings.seed,
             "max_depth": settings.max_depth,
-            "roulette_depth": settings.roulette_depth if settings.termination == "roulette" else 0xFFFFFFFF,
+            "roulette_depth": settings.roulette_depth
+            if settings.termination == "roulette"
+            else 0xFFFFFFFF,
             "light_count": light_count,
             "triangle_count": geometry.count,
             "material_count": len(scene.materials),
@@ -330,11 +340,15 @@ class Renderer:
         self.bounce_launches: list[Launch] = []
         for stage in self.plan.stages:
             if stage.name == "film":
-                self.film_program = load_program(self.device, stage.source, self.plan.defines(stage))
+                self.film_program = load_program(
+                    self.device, stage.source, self.plan.defines(stage)
+                )
                 continue
             defines = self.plan.defines(stage) | {"STACK_SIZE": self.bvh.stack_size}
             program = load_program(self.device, stage.source, defines)
-            self.bounce_launches += [program.bind_planned(name, self.buffers) for name in stage.kernels]
+            self.bounce_launches += [
+                program.bind_planned(name, self.buffers) for name in stage.kernels
+            ]
         self.film_launches = [
             (self._add_launch(ring, name, planes, partial=False), planes)
             for ring, name, planes in film.PLANES

@@ -29,19 +29,27 @@ class Settings:
     """All that changes the estimator.  Anything else (output, device, budget) is not a setting."""
 
     integrator: str = _choice("path", doc="how paths are built")
-    light_sampling: str = _choice("power", "uniform", doc="how next event estimation picks an emitter")
+    light_sampling: str = _choice(
+        "power", "uniform", doc="how next event estimation picks an emitter"
+    )
     direct_sampling: str = _choice(
         "mis", "light", "bsdf", doc="direct light by both strategies, or by one of them alone"
     )
     termination: str = _choice("roulette", "off", doc="how paths end before max_depth")
-    roulette_depth: int = _number(5, 0, 1 << 20, doc="bounces before Russian roulette may end a path")
+    roulette_depth: int = _number(
+        5, 0, 1 << 20, doc="bounces before Russian roulette may end a path"
+    )
     max_depth: int = _number(16, 0, 1 << 20, doc="bounces; 0 is what the camera sees directly")
-    sampler: str = _choice("sobol", "random", doc="Owen-scrambled Sobol' points, or independent numbers")
+    sampler: str = _choice(
+        "sobol", "random", doc="Owen-scrambled Sobol' points, or independent numbers"
+    )
     seed: int = _number(0, 0, 0xFFFFFFFF, doc="start of every random sequence")
 
     def __post_init__(self) -> None:
         for item in dataclasses.fields(self):
-            object.__setattr__(self, item.name, _checked(item, getattr(self, item.name), "settings"))
+            object.__setattr__(
+                self, item.name, _checked(item, getattr(self, item.name), "settings")
+            )
 
     def with_values(self, values: Mapping[str, Any], source: str = "settings") -> Settings:
         """Return a copy with ``values`` applied; errors name ``source`` and the key.
@@ -66,7 +74,9 @@ def _checked(item: dataclasses.Field[Any], value: Any, source: str) -> Any:
     choices = item.metadata.get("choices")
     if choices is not None:
         if value not in choices:
-            raise InputError(f"{source}: {item.name} must be one of {', '.join(choices)}; got {value!r}")
+            raise InputError(
+                f"{source}: {item.name} must be one of {', '.join(choices)}; got {value!r}"
+            )
         return value
     low, high = item.metadata["range"]
     kind = type(item.default)
@@ -76,7 +86,9 @@ def _checked(item: dataclasses.Field[Any], value: Any, source: str) -> Any:
     except ValueError:
         number = None
     if isinstance(number, bool) or not isinstance(number, (int, float) if kind is float else int):
-        raise InputError(f"{source}: {item.name} must be {wanted} from {low} to {high}; got {value!r}")
+        raise InputError(
+            f"{source}: {item.name} must be {wanted} from {low} to {high}; got {value!r}"
+        )
     if not (math.isfinite(number) and low <= number <= high):
         raise InputError(f"{source}: {item.name} must be from {low} to {high}; got {value!r}")
     return kind(number)

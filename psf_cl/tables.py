@@ -50,7 +50,9 @@ def flatten(scene: Scene) -> Geometry:
     for shape in scene.shapes:
         mesh = shape.mesh
         linear = shape.transform[:3, :3]
-        with np.errstate(all="ignore"):  # What overflows here is dropped, and counted, as not finite.
+        with np.errstate(
+            all="ignore"
+        ):  # What overflows here is dropped, and counted, as not finite.
             world = (mesh.positions @ linear.T + shape.transform[:3, 3]).astype(np.float32)
             corners = world[mesh.triangles]
             surface = np.zeros(len(corners), layout.SURFACE.dtype)
@@ -81,7 +83,9 @@ def flatten(scene: Scene) -> Geometry:
 
     points = joined(positions, np.dtype(np.float32), (9,))
     finite = points[np.isfinite(points).all(axis=1)].reshape(-1, 3).astype(np.float64)
-    low, high = (finite.min(axis=0), finite.max(axis=0)) if len(finite) else (np.zeros(3), np.zeros(3))
+    low, high = (
+        (finite.min(axis=0), finite.max(axis=0)) if len(finite) else (np.zeros(3), np.zeros(3))
+    )
     return Geometry(
         points,
         joined(surfaces, layout.SURFACE.dtype),
@@ -96,7 +100,11 @@ def _world_normals(normals: np.ndarray, linear: np.ndarray) -> np.ndarray:
     """Return unit normals under ``linear``; zero where they have no direction."""
     # The cofactor matrix is the inverse transpose up to scale, and exists for singular transforms too.
     cofactor = np.stack(
-        [np.cross(linear[1], linear[2]), np.cross(linear[2], linear[0]), np.cross(linear[0], linear[1])]
+        [
+            np.cross(linear[1], linear[2]),
+            np.cross(linear[2], linear[0]),
+            np.cross(linear[0], linear[1]),
+        ]
     )
     if np.linalg.det(linear) < 0:
         cofactor = -cofactor
@@ -135,27 +143,38 @@ def material_table(materials: tuple[Material, ...]) -> np.ndarray:
         row["specular"] = material.specular
         row["ior"] = ior
         row["transmission"] = material.transmission
-        row["base_color_texture"] = material.base_color_texture if material.base_color_texture >= 0 else none
-        row["emission_texture"] = material.emission_texture if material.emission_texture >= 0 else none
+        row["base_color_texture"] = (
+            material.base_color_texture if material.base_color_texture >= 0 else none
+        )
+        row["emission_texture"] = (
+            material.emission_texture if material.emission_texture >= 0 else none
+        )
         flags = layout.CONSTANT["MATERIAL_TWO_SIDED_EMISSION"] if material.double_sided else 0
         if is_cut_out(material):
             flags |= layout.CONSTANT["MATERIAL_ALPHA_MASK"]
         row["flags"] = flags
-        row["alpha_cutoff"] = material.alpha_cutoff / material.alpha if material.alpha > 0 else np.inf
+        row["alpha_cutoff"] = (
+            material.alpha_cutoff / material.alpha if material.alpha > 0 else np.inf
+        )
     return table
 
 
 def srgb_to_linear() -> np.ndarray:
     """Return ``(256,)`` float32: the linear value of each 8-bit sRGB code (IEC 61966-2-1)."""
     code = np.arange(256) / 255.0
-    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(
+        np.float32
+    )
 
 
 def texture_tables(textures: tuple[Texture, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return ``(n,)`` layout.TEXTURE and all texels, ``(m, 4)`` uint8."""
     table = np.zeros(max(len(textures), 1), layout.TEXTURE.dtype)
     table["width"] = table["height"] = 1
-    bits = {"clamp": ("TEXTURE_CLAMP_U", "TEXTURE_CLAMP_V"), "mirror": ("TEXTURE_MIRROR_U", "TEXTURE_MIRROR_V")}
+    bits = {
+        "clamp": ("TEXTURE_CLAMP_U", "TEXTURE_CLAMP_V"),
+        "mirror": ("TEXTURE_MIRROR_U", "TEXTURE_MIRROR_V"),
+    }
     texels, offset = [], 0
     for row, texture in zip(table, textures, strict=False):
         height, width = texture.pixels.shape[:2]
@@ -219,7 +238,9 @@ def light_table(scene: Scene, geometry: Geometry, sampling: str) -> tuple[np.nda
     """
     glow = np.array([emits(material) for material in scene.materials], bool)
     sided = np.array([2.0 if material.double_sided else 1.0 for material in scene.materials])
-    radiance = np.array([_mean_emission(scene, material) @ LUMINANCE for material in scene.materials])
+    radiance = np.array(
+        [_mean_emission(scene, material) @ LUMINANCE for material in scene.materials]
+    )
     material = geometry.surfaces["material"]
     triangles = np.flatnonzero(glow[material])
     with np.errstate(all="ignore"):
@@ -229,7 +250,9 @@ def light_table(scene: Scene, geometry: Geometry, sampling: str) -> tuple[np.nda
         )
         area = 0.5 * np.linalg.norm(cross, axis=1)
     # float32 tells the areas of these on the device; smaller ones have none there.
-    sound = np.isfinite(area) & (area > 1e-30) & np.isfinite(geometry.positions[triangles]).all(axis=1)
+    sound = (
+        np.isfinite(area) & (area > 1e-30) & np.isfinite(geometry.positions[triangles]).all(axis=1)
+    )
     triangles, area = triangles[sound], area[sound]
 
     sky = has_environment(scene.environment)
@@ -350,7 +373,9 @@ def pixel_order(x: int, y: int, width: int, height: int) -> np.ndarray:
 
     Along a Morton curve, so that the lanes of a block, and the slots in flight, see neighbours.
     """
-    columns, rows = np.meshgrid(np.arange(width, dtype=np.uint64), np.arange(height, dtype=np.uint64))
+    columns, rows = np.meshgrid(
+        np.arange(width, dtype=np.uint64), np.arange(height, dtype=np.uint64)
+    )
 
     def spread(v: np.ndarray) -> np.ndarray:
         v = (v | (v << 8)) & 0x00FF00FF
@@ -360,9 +385,9 @@ def pixel_order(x: int, y: int, width: int, height: int) -> np.ndarray:
 
     code = spread(columns.ravel()) | (spread(rows.ravel()) << np.uint64(1))
     order = np.argsort(code, kind="stable")
-    return (((rows.ravel() + np.uint64(y)) << np.uint64(16)) | (columns.ravel() + np.uint64(x)))[order].astype(
-        np.uint32
-    )
+    return (((rows.ravel() + np.uint64(y)) << np.uint64(16)) | (columns.ravel() + np.uint64(x)))[
+        order
+    ].astype(np.uint32)
 
 
 def camera_values(camera: Camera, width: int, height: int) -> dict[str, object]:
@@ -370,7 +395,9 @@ def camera_values(camera: Camera, width: int, height: int) -> dict[str, object]:
     matrix = camera.transform
     scale_y = math.tan(camera.fov_y / 2)
     if not (np.isfinite(matrix).all() and math.isfinite(scale_y) and scale_y > 0):
-        raise InputError(f"camera {camera.name!r}: expected a finite position and a field of view below 180")
+        raise InputError(
+            f"camera {camera.name!r}: expected a finite position and a field of view below 180"
+        )
     return {
         "camera_origin": matrix[:3, 3],
         "camera_right": matrix[:3, 0],

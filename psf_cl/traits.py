@@ -25,7 +25,9 @@ class DeviceTraits:
 
     def __post_init__(self) -> None:
         if self.lanes not in (1, 8, 16) or self.block % self.lanes or self.slots % self.block:
-            raise ValueError(f"lanes {self.lanes}, block {self.block}, slots {self.slots} do not nest")
+            raise ValueError(
+                f"lanes {self.lanes}, block {self.block}, slots {self.slots} do not nest"
+            )
 
     @classmethod
     def of_kind(cls, kind: str) -> DeviceTraits:

@@ -92,7 +92,9 @@ class Device:
             # A pattern of one byte divides every size.
             cl.enqueue_fill_buffer(self.queue, memory, np.uint8(0), 0, size)
         except (cl.MemoryError, cl.RuntimeError, cl.LogicError) as error:
-            raise DeviceError(f"{name}: {size / 2**20:.0f} MiB refused by {self.name}: {error}") from error
+            raise DeviceError(
+                f"{name}: {size / 2**20:.0f} MiB refused by {self.name}: {error}"
+            ) from error
         self.allocated_bytes += size
         self.peak_bytes = max(self.peak_bytes, self.allocated_bytes)
         return Buffer(name, dtype, count, memory)
@@ -229,7 +231,9 @@ def open_device(
     if text is not None:
         chosen = [d for d, name in zip(devices, names, strict=True) if text.lower() in name.lower()]
         if not chosen:
-            raise InputError(f"{source}: no device matches {text!r}; there are: {'; '.join(names) or 'none'}")
+            raise InputError(
+                f"{source}: no device matches {text!r}; there are: {'; '.join(names) or 'none'}"
+            )
         devices = chosen
     rank = {cl.device_type.GPU: 0, cl.device_type.ACCELERATOR: 1}
     devices.sort(key=lambda device: rank.get(device.type, 2))

@@ -32,10 +32,7 @@ class Record:
     @property
     def dtype(self) -> np.dtype:
         scalars = {"float": "<f4", "uint": "<u4", "int": "<i4"}
-        return np.dtype(
-            [(item.name, scalars[item.type], item.shape) for item in self.fields],
-            metadata={"c_name": self.name},
-        )
+        return np.dtype([(item.name, scalars[item.type], item.shape) for item in self.fields])
 
     def c_text(self) -> str:
         lines = [f"/// {self.meaning}", "typedef struct {"]

@@ -11,6 +11,7 @@ import numpy as np
 import pyopencl as cl
 
 from psf_cl.device.device import Buffer, Device
+from psf_cl.device.layout import RECORDS
 from psf_cl.device.sources import kernel_folder
 from psf_cl.errors import DeviceError
 
@@ -65,11 +66,16 @@ class Program:
         defines: every macro that it was built with.
     """
 
-    def __init__(self, device: Device, file: str, defines: dict[str, int], folder: Path | None) -> None:
+    def __init__(
+        self, device: Device, file: str, defines: dict[str, int], folder: Path | None
+    ) -> None:
         self.device = device
         self.file = file
         self.defines = defines
-        options = [*_BUILD_OPTIONS, *(f"-D{name}={value}" for name, value in sorted(defines.items()))]
+        options = [
+            *_BUILD_OPTIONS,
+            *(f"-D{name}={value}" for name, value in sorted(defines.items())),
+        ]
         source = assemble(file, folder)
         try:
             self.program = device.timed_compile(
@@ -98,9 +104,7 @@ class Program:
 
 def argument_names(kernel: cl.Kernel) -> list[str]:
     """Return the names of a kernel's arguments in their order."""
-    return [
-        kernel.get_arg_info(index, cl.kernel_arg_info.NAME) for index in range(kernel.num_args)
-    ]
+    return [kernel.get_arg_info(index, cl.kernel_arg_info.NAME) for index in range(kernel.num_args)]
 
 
 def load_program(
@@ -157,7 +161,9 @@ class Launch:
         """Change arguments; returns the launch."""
         for name, value in arguments.items():
             if name not in self.parameters:
-                raise TypeError(f"{self.label}: no argument {name}; has {', '.join(self.parameters)}")
+                raise TypeError(
+                    f"{self.label}: no argument {name}; has {', '.join(self.parameters)}"
+                )
             index, spelled, pointer = self.parameters[name]
             self.kernel.set_arg(index, self._converted(name, value, spelled, pointer))
             self.held[name] = value
@@ -170,7 +176,11 @@ class Launch:
             wanted = _type_name(value.dtype)
             base = spelled.rstrip("*")
             # float16* and the like are views of floats.
-            if wanted != base and wanted != re.sub(r"\d+$", "", base) and base not in ("void", "uchar"):
+            if (
+                wanted != base
+                and wanted != re.sub(r"\d+$", "", base)
+                and base not in ("void", "uchar")
+            ):
                 raise TypeError(f"{self.label}: {name} is {spelled}, got a buffer of {wanted}")
             return value.memory
         if spelled not in _SCALARS:
@@ -189,7 +199,8 @@ class Launch:
 
 
 def _type_name(dtype: np.dtype[Any]) -> str:
-    if dtype.names is not None:
-        return str((dtype.metadata or {}).get("c_name", "void"))
+    for record in RECORDS:
+        if dtype == record.dtype:
+            return record.name
     names = {np.dtype(scalar): name for name, scalar in _SCALARS.items()}
     return names.get(dtype, str(dtype))

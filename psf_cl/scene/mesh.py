@@ -83,14 +83,18 @@ def _load_ply(path: Path, data: bytes) -> Scene:
 
 
 def _load_stl(path: Path, data: bytes) -> Scene:
-    from trimesh.exchange.stl import HeaderError, load_stl
+    from trimesh.exchange.stl import load_stl_ascii, load_stl_binary
 
-    read = _guarded(path, "STL", lambda: load_stl(io.BytesIO(data)), HeaderError)
-    # A file with several solids has a table of meshes, any other is the mesh itself.
-    shapes = _shapes(path, read.get("geometry", {"": read}).values())
-    if not shapes and data.lstrip()[:5].lower() != b"solid":
+    # Some binary files begin with "solid" too, so the length decides.
+    if len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):
+        read = _guarded(path, "STL", lambda: load_stl_binary(io.BytesIO(data)))
+    elif data.lstrip()[:5].lower() == b"solid":
+        read = _guarded(path, "STL", lambda: load_stl_ascii(io.StringIO(_decoded(data))))
+    else:
         raise InputError(f"{path}: neither ASCII STL nor binary STL of the length in its header")
-    return Scene(path=str(path), shapes=shapes)
+    # A file with several solids has a table of meshes, any other is the mesh itself.
+    parts = read.get("geometry", {"": read}).values()
+    return Scene(path=str(path), shapes=_shapes(path, parts))
 
 
 def _shapes(path: Path, parts: Iterable[dict[str, Any]]) -> tuple[Shape, ...]:
@@ -98,9 +102,14 @@ def _shapes(path: Path, parts: Iterable[dict[str, Any]]) -> tuple[Shape, ...]:
     return tuple(Shape(mesh.name, mesh, np.eye(4), 0) for mesh in meshes if mesh is not None)
 
 
-def _guarded(
-    path: Path, name: str, read: Callable[[], dict[str, Any]], *more: type[Exception]
-) -> dict[str, Any]:
+def _decoded(data: bytes) -> str:
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
+def _guarded(path: Path, name: str, read: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """Return what ``read`` returns; what it raises becomes an InputError."""
     try:
         with warnings.catch_warnings():
@@ -108,7 +117,7 @@ def _guarded(
             warnings.filterwarnings("error", "string or file could not be read", DeprecationWarning)
             warnings.filterwarnings("ignore", category=RuntimeWarning)
             return read()
-    except (*_READER_ERRORS, *more) as error:
+    except _READER_ERRORS as error:
         reason = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: not a sound {name} file ({reason})") from None
 
@@ -120,6 +129,8 @@ def _checked_mesh(path: Path, name: str, part: dict[str, Any]) -> Mesh | None:
         return None
     faces = np.asarray(faces)
     positions = _float32(part["vertices"])
+    if positions.ndim != 2 or positions.shape[1] != 3:
+        raise InputError(f"{path}: expected vertices of 3 coordinates")
     if faces.ndim != 2 or faces.dtype.kind not in "iu" or faces.shape[1] < 3:
         raise InputError(f"{path}: expected faces of at least 3 integer vertex indices")
     low, high = int(faces.min()), int(faces.max())
@@ -178,11 +189,7 @@ class _MaterialNames:
 def _load_obj(path: Path, data: bytes) -> Scene:
     from trimesh.exchange.obj import load_obj
 
-    try:
-        text = data.decode("utf-8")
-    except UnicodeDecodeError:
-        text = data.decode("latin-1")
-    text = _plain_obj(path, text)
+    text = _plain_obj(path, _decoded(data))
     libraries = re.findall(r"^mtllib (.+)$", text, re.MULTILINE)
     text = "mtllib names\n" + text
     resolver: Any = _MaterialNames(text)
@@ -193,7 +200,7 @@ def _load_obj(path: Path, data: bytes) -> Scene:
     known = _read_libraries(path, libraries, textures, notes)
     materials: dict[str, Material] = {}
     shapes = []
-    unknown = set()
+    unknown: list[str] = []
     for part in read.get("geometry", {}).values():
         used = getattr(part.get("visual"), "material", None)
         name = str(used.name) if used is not None and used.name else Material().name
@@ -201,11 +208,11 @@ def _load_obj(path: Path, data: bytes) -> Scene:
         if mesh is None:
             continue
         if name not in known and name != Material().name:
-            unknown.add(name)
+            unknown.append(name)
         materials.setdefault(name, known.get(name, Material(name=name)))
         shapes.append(Shape(name, mesh, np.eye(4), list(materials).index(name)))
     if unknown:
-        notes.append(f"{path}: {len(unknown)} materials are not defined and stay grey.")
+        notes.append(f"{path}: undefined materials stay grey: {_listed(unknown)}.")
     return Scene(
         path=str(path),
         shapes=tuple(shapes),
@@ -213,6 +220,12 @@ def _load_obj(path: Path, data: bytes) -> Scene:
         textures=tuple(textures),
         notes=tuple(notes),
     )
+
+
+def _listed(items: list[str]) -> str:
+    """Return the first items in one line, and how many more there are."""
+    more = f" and {len(items) - 3} more" if len(items) > 3 else ""
+    return ", ".join(items[:3]) + more
 
 
 def _plain_obj(path: Path, text: str) -> str:
@@ -290,8 +303,7 @@ def _read_libraries(
                 continue
             known |= _parse_mtl(path, text, textures, lost_textures)
     if lost_textures:
-        first = lost_textures[0]
-        notes.append(f"{path}: {len(lost_textures)} textures are left out (the first: {first}).")
+        notes.append(f"{path}: textures are left out: {_listed(lost_textures)}.")
     return known
 
 

@@ -1,6 +1,6 @@
 """A scene as plain NumPy data: read-only, no files, no OpenCL.
 
-Meters, Y up, right-handed.  Radiance, candela and lux are Rec.709 triples, linear, taken as numbers.
+Meters, Y up, right-handed.  Radiance, candela and lux are linear Rec.709 triples, taken as numbers.
 Every reader (TOML, glTF, OBJ, PLY, STL) fills these records and nothing else.
 """
 

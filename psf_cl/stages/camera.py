@@ -16,7 +16,9 @@ def plan(context: Context) -> StageSpec:
     buffers = [
         BufferSpec("pool", float32, slots * len(layout.PATH_FIELDS), f"state of {slots} paths"),
         BufferSpec("pixel_order", uint32, context.pixel_count, "pixels in the order of the queue"),
-        BufferSpec("counters", uint32, layout.COUNTER_INDEX["finished"] + context.ring, "queue and rays"),
+        BufferSpec(
+            "counters", uint32, layout.COUNTER_INDEX["finished"] + context.ring, "queue and rays"
+        ),
         BufferSpec("samples", float32, samples, f"radiance of {context.ring} passes in flight"),
     ]
     if context.on("AOV_DIRECT"):

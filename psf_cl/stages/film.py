@@ -17,10 +17,14 @@ def plan(context: Context) -> StageSpec:
     dtype = layout.FILM_SUM.dtype
     buffers = [BufferSpec("film", dtype, context.pixel_count, "sums of the image")]
     if context.on("AOV_DIRECT"):
-        buffers.append(BufferSpec("film_direct", dtype, context.pixel_count, "sums of the direct light"))
+        buffers.append(
+            BufferSpec("film_direct", dtype, context.pixel_count, "sums of the direct light")
+        )
     if context.on("AOV_FEATURES"):
         count = 3 * context.pixel_count
-        buffers.append(BufferSpec("film_features", dtype, count, "sums of albedo, normal and depth"))
+        buffers.append(
+            BufferSpec("film_features", dtype, count, "sums of albedo, normal and depth")
+        )
     return StageSpec(
         "film",
         "samples are summed pass by pass",

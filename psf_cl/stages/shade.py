@@ -13,7 +13,12 @@ def plan(context: Context) -> StageSpec:
     if context.on("AOV_FEATURES"):
         count = 3 * context.ring * context.pixel_count * 4
         buffers.append(
-            BufferSpec("features", np.dtype(np.float32), count, "albedo, normal and depth of passes in flight")
+            BufferSpec(
+                "features",
+                np.dtype(np.float32),
+                count,
+                "albedo, normal and depth of passes in flight",
+            )
         )
     return StageSpec(
         "shade",
