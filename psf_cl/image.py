@@ -17,7 +17,7 @@ import PIL.Image
 
 import psf_cl
 from psf_cl.errors import InputError
-from psf_cl.files import write_whole
+from psf_cl.files import read_file, write_whole
 
 # What can be asked for beside "rgb".
 AOVS = {
@@ -171,10 +171,7 @@ def read_exr(path: str | os.PathLike[str]) -> Image:
     Raises:
         InputError: missing, not an EXR file, damaged, or of a kind that has no plain pixels.
     """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot read: {error.strerror or error}") from error
+    data = read_file(Path(path))
     if not data.startswith(b"\x76\x2f\x31\x01"):
         raise InputError(f"{path}: expected an OpenEXR image")
     try:

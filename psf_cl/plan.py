@@ -128,7 +128,8 @@ def make_plan(
         or y + height > scene.height
     ):
         raise InputError(
-            f"--crop: {x},{y},{width},{height} is not inside the film of {scene.width}x{scene.height}"
+            f"--crop: {x},{y},{width},{height} is not inside the film of "
+            f"{scene.width}x{scene.height}"
         )
 
     features = _features(scene, outputs)

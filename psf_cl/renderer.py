@@ -33,6 +33,7 @@ class Renderer:
 
     Args:
         outputs: AOVs to deliver besides the image (``psf_cl.plan.AOVS``).
+        statistics: whether to measure stages (if ``device`` profiles) and occupancy for ``stats``.
         crop: (x, y, width, height) in pixels, or None for the whole film.
 
     Raises:
@@ -47,15 +48,19 @@ class Renderer:
         device: Device | None = None,
         outputs: Iterable[str] = (),
         crop: tuple[int, int, int, int] | None = None,
+        statistics: bool = False,
     ) -> None:
         start = time.perf_counter()
         self.scene = scene
         self.settings = settings or resolve(scene.render, scene.path)
         if not scene.cameras:
             raise InputError(f"{scene.path}: no camera")
-        self.device = device or open_device()
+        self.device = device or open_device(profiling=statistics)
         self.plan: Plan = make_plan(scene, self.settings, outputs, self.device.traits, crop)
         self.excluded_seconds = 0.0
+        self.statistics = statistics
+        self.censuses = 0
+        self.depth_counts = np.zeros(OCCUPANCY_BINS)
         self.buffers: dict[str, Buffer] = {}
         self._allocate()
         geometry = self._upload_scene()
@@ -84,7 +89,14 @@ class Renderer:
         self.advance(1)
 
     def _counters(self) -> np.ndarray:
-        return self.device.read(self.buffers["counters"])
+        if self.statistics:
+            self.census(self.plan.traits.slots, film.GROUP)
+            self.depth_counts += self.device.read(self.buffers["census"])
+            self.device.fill(self.buffers["census"])
+            self.censuses += 1
+        counters = self.device.read(self.buffers["counters"])
+        self.device.collect_events()
+        return counters
 
     def _limit(self, passes: int) -> None:
         value = np.array([passes], np.uint32)
@@ -190,7 +202,7 @@ class Renderer:
 
     def stats(self) -> dict[str, Any]:
         """Return what ``--stats`` writes, without errors against a reference."""
-        counters = self._counters()
+        counters = self.device.read(self.buffers["counters"])
 
         def wide(name: str) -> int:
             at = layout.COUNTER_INDEX[name]
@@ -204,7 +216,7 @@ class Renderer:
         }
         stages = [
             {"name": name, "launches": launches, "seconds": seconds, "items": items}
-            for name, (launches, seconds, items) in self._stage_totals().items()
+            for name, (launches, seconds, items) in self.device.totals.items()
         ]
         return {
             "scene": self.scene.path,
@@ -355,6 +367,16 @@ class Renderer:
             if name in self.buffers
         ]
         self.advance = self.film_program.bind_planned("advance_film", self.buffers)
+        if self.statistics:
+            census = self.device.allocate("census", np.uint32, OCCUPANCY_BINS)
+            self.buffers["census"] = census
+            self.census = self.film_program.bind(
+                "count_depths",
+                params=self.buffers["params"],
+                pool=self.buffers["pool"],
+                census=census,
+                bins=OCCUPANCY_BINS,
+            )
 
     def _add_launch(self, ring: str, name: str, planes: int, partial: bool) -> Launch:
         return self.film_program.bind(
@@ -368,31 +390,22 @@ class Renderer:
         )
 
     def _warm_up(self) -> None:
-        """Launch everything once while no pass may start: PoCL generates code at the first launch."""
+        """Launch everything once while no pass may start: PoCL generates code only then."""
         self._limit(0)
         self._bounce()
         self._film()
+        if self.statistics:
+            self.census(self.plan.traits.slots, film.GROUP)
         self.device.wait()
-        self.device.events.clear()
+        self.device.collect_events()
+        self.device.totals.clear()
 
-    # Statistics.
-
-    def _occupancy(self) -> list[int]:
-        """Return the living paths of the pool by their bounces so far."""
-        census = self.device.allocate("census", np.uint32, OCCUPANCY_BINS)
-        self.film_program.bind(
-            "count_depths",
-            params=self.buffers["params"],
-            pool=self.buffers["pool"],
-            census=census,
-            bins=OCCUPANCY_BINS,
-        )(self.plan.traits.slots, film.GROUP)
-        counts = [int(count) for count in self.device.read(census)]
-        self.device.release(census)
-        return counts
-
-    def _stage_totals(self) -> dict[str, tuple[int, float, int]]:
-        return self.device.stage_seconds() if self.device.profiling else {}
+    def _occupancy(self) -> list[float] | None:
+        """Return the mean share of the slots whose path lives, by its bounces so far."""
+        if not self.statistics:
+            return None
+        shares = self.depth_counts / (max(self.censuses, 1) * self.plan.traits.slots)
+        return [float(share) for share in shares]
 
 
 def render(

@@ -88,7 +88,7 @@ class Scheduler:
         seconds: float | None,
         progress: Callable[[Progress], bool | None] | None = None,
     ) -> bool:
-        """Add passes until there are ``spp``, or the pass ends in which the budget of ``seconds`` does.
+        """Add passes until there are ``spp``, or the pass ends in which ``seconds`` are spent.
 
         Clocks decide only how many passes there are, never what is in them.
 

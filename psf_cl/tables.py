@@ -98,7 +98,7 @@ def flatten(scene: Scene) -> Geometry:
 
 def _world_normals(normals: np.ndarray, linear: np.ndarray) -> np.ndarray:
     """Return unit normals under ``linear``; zero where they have no direction."""
-    # The cofactor matrix is the inverse transpose up to scale, and exists for singular transforms too.
+    # The cofactor matrix is the inverse transpose up to scale; singular transforms have one too.
     cofactor = np.stack(
         [
             np.cross(linear[1], linear[2]),
@@ -229,7 +229,7 @@ def alias_table(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def light_table(scene: Scene, geometry: Geometry, sampling: str) -> tuple[np.ndarray, float]:
-    """Return ``(n,)`` layout.LIGHT and the environment's chance; sets ``geometry.surfaces["light"]``.
+    """Return ``(n,)`` layout.LIGHT and the environment's chance; sets the surfaces' ``light``.
 
     Entries are the emitting triangles (those with an area), the environment, the punctual lights.
 
@@ -332,7 +332,7 @@ def has_environment(environment: Environment) -> bool:
 
 
 def _environment_weights(image: np.ndarray) -> np.ndarray:
-    """Return the solid angle of each row of a lat-long image, ``(h, 1)``; sums to 4 pi over all texels."""
+    """Return the solid angle of a texel in each row of a lat-long image, ``(h, 1)``."""
     height, width = image.shape[:2]
     edges = np.cos(np.pi * np.arange(height + 1) / height)
     return ((edges[:-1] - edges[1:]) * (2.0 * np.pi / width))[:, None]
@@ -349,8 +349,8 @@ def _environment_mean(environment: Environment) -> np.ndarray:
 def environment_cells(environment: Environment) -> np.ndarray:
     """Return ``(h * w,)`` layout.ENVIRONMENT_CELL.
 
-    Chances follow what bilinear look-ups return in a cell: its texel and parts of its neighbours, so
-    that no direction with light has none.
+    Chances follow what bilinear look-ups return in a cell: its texel and parts of its neighbours,
+    so that no direction with light has none.
     """
     image = environment.image
     if image is None:

@@ -28,3 +28,13 @@ def device() -> Device:
         if os.environ.get("PSF_CL_ALLOW_NO_DEVICE") == "1":
             pytest.skip(str(error))
         pytest.fail(f"{error}; to run only what needs no device: PSF_CL_ALLOW_NO_DEVICE=1")
+
+
+@pytest.fixture(scope="session", params=[1, 8, 16], ids=lambda lanes: f"W{lanes}")
+def lane_device(device: Device, request: pytest.FixtureRequest) -> Device:
+    """Return the same device with kernels for W = 1, 8 and 16 lanes."""
+    from psf_cl.device.device import Device
+    from psf_cl.traits import DeviceTraits
+
+    kind, lanes = device.traits.kind, request.param
+    return Device(device.cl_device, DeviceTraits(kind, lanes, block=16, slots=1024, group=8))

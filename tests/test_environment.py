@@ -126,8 +126,8 @@ GOOD = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 2 +X 8\n"
     ("name", "data", "expected"),
     [
         ("a.png", b"", "expected an environment image, .exr or .hdr"),
-        ("a.exr", b"", "not an OpenEXR file"),
-        ("a.exr", b"\x76\x2f\x31\x01", "broken OpenEXR"),
+        ("a.exr", b"", "expected an OpenEXR image"),
+        ("a.exr", b"\x76\x2f\x31\x01", "damaged or truncated OpenEXR"),
         ("a.hdr", b"", "no #? header"),
         ("a.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n\n-Y 1 +X 1\nabcd", "expected FORMAT"),
         ("a.hdr", b"#?RADIANCE\nEXPOSURE=0\n\n-Y 1 +X 1\nabcd", "EXPOSURE"),
@@ -165,7 +165,7 @@ def test_a_damaged_exr_loads_or_is_refused(tmp_path):
 
 def test_depth_alone_is_no_environment(tmp_path):
     path = write_exr(tmp_path / "a.exr", {"Z": SKY[..., 0].copy()})
-    with pytest.raises(InputError, match="expected channels R, G, B or Y; got Z"):
+    with pytest.raises(InputError, match="expected channels R, G, B or Y; there are: Z"):
         load_environment(path)
 
 

@@ -131,8 +131,6 @@ def test_sort_keeps_the_order_of_equal_keys(device, primitives, buffers, dtype, 
 def test_sort_by_the_low_bits_alone(device, primitives, buffers, dtype, key_bits):
     keys = np.random.default_rng(3).integers(0, 2**key_bits, 10_000, dtype)
     values = np.arange(len(keys), dtype=np.uint32)
-    found_keys, found_values = sort_on_device(
-        device, primitives, buffers, keys, values, key_bits
-    )
+    found_keys, found_values = sort_on_device(device, primitives, buffers, keys, values, key_bits)
     np.testing.assert_array_equal(found_keys, np.sort(keys))
     np.testing.assert_array_equal(found_values, np.argsort(keys, kind="stable"))

@@ -135,9 +135,7 @@ def write_gltf(folder: Path) -> None:
             }
         ],
         "bufferViews": [{"buffer": 0, "byteLength": 36}],
-        "buffers": [
-            {"byteLength": 36, "uri": f"data:application/octet-stream;base64,{positions}"}
-        ],
+        "buffers": [{"byteLength": 36, "uri": f"data:application/octet-stream;base64,{positions}"}],
     }
     (folder / "tri.gltf").write_text(json.dumps(document))
     Image.new("RGB", (1, 1), (1, 2, 3)).save(folder / "pixels.png")

@@ -85,9 +85,7 @@ class Model:
             first = np.cumsum([0, *(len(mesh.positions) for mesh in meshes)])
             positions = _rounded([mesh.positions for mesh in meshes], POSITION_STEPS)
             low, high = positions.min(axis=0).tolist(), positions.max(axis=0).tolist()
-            attributes = {
-                "POSITION": accessor(positions, "VEC3", 5126, 34962, min=low, max=high)
-            }
+            attributes = {"POSITION": accessor(positions, "VEC3", 5126, 34962, min=low, max=high)}
             if smooth:
                 normals = _rounded([mesh.normals for mesh in meshes], NORMAL_STEPS)
                 attributes["NORMAL"] = accessor(normals, "VEC3", 5126, 34962)

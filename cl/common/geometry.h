@@ -17,10 +17,6 @@
 // Ize: Robust BVH Ray Traversal, JCGT 2 (2), 2013.
 #define BOX_FAR_FACTOR 1.0000004f
 
-// How much nearer than a hit a box must be proved to be passed over: its triangle's distance is
-// computed along another way, and equal distances must meet to let the lowest id win.
-#define CULL_FACTOR 1.000001f
-
 /// A ray; the direction need not be unit, t counts in its lengths.
 typedef struct {
     float origin[3];

@@ -139,11 +139,11 @@ inline Float max3(Vec3 a) { return max(a.x, max(a.y, a.z)); }
 inline Float luminance(Vec3 c) { return 0.2126f * c.x + 0.7152f * c.y + 0.0722f * c.z; }
 
 /// Unit vector along `v`, also where the square of its length would leave the range of float;
-/// (0, 0, 1) where `v` has no direction.
+/// (0, 0, 1) where `v` has no direction, or is too small for its reciprocal.
 inline Vec3 normalize3(Vec3 v)
 {
     const Float largest = max(fabs(v.x), max(fabs(v.y), fabs(v.z)));
-    const Mask ok = (largest > 0.0f) & (largest < INFINITY);
+    const Mask ok = (largest >= FLT_MIN) & (largest < INFINITY);
     const Vec3 s = scale(v, 1.0f / pick(ok, largest, (Float)(1.0f)));
     const Vec3 unit = scale(s, 1.0f / sqrt(dot3(s, s)));
     return pick_v(ok, unit, vec3((Float)(0.0f), (Float)(0.0f), (Float)(1.0f)));

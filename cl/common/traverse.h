@@ -40,8 +40,8 @@ static inline Hit trace_closest_setup(
     uint count = ray->t_max > 0.0f ? 1 : 0;
     while (count > 0) {
         --count;
-        const float limit = best.t * CULL_FACTOR;
-        if (entered[count] > limit)
+        // Not where it is equal: of equally near triangles the lowest index wins.
+        if (entered[count] > best.t)
             continue;
         const uint next = waiting[count];
         if (next & LEAF_BIT) {
@@ -73,7 +73,7 @@ static inline Hit trace_closest_setup(
 
         __global const BvhNode *node = &nodes[next];
         float8 near;
-        const int8 met = intersect_boxes(node, ray, limit, &near);
+        const int8 met = intersect_boxes(node, ray, best.t, &near);
         int hit[8];
         float entry[8];
         vstore8(met, 0, hit);

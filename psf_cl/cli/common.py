@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+import time
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 from psf_cl.errors import InputError
@@ -14,6 +15,10 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from psf_cl.scene.model import Scene
+
+
+#: When the program started, by ``time.perf_counter()``.
+START = time.perf_counter()
 
 
 class Parser(argparse.ArgumentParser):

@@ -28,7 +28,7 @@ def run(args: argparse.Namespace) -> int:
 
     scene, settings = load_with_settings(args)
     tell_notes(scene)
-    plan = make_plan(scene, settings, outputs=args.aov, device=None, crop=args.crop)
+    plan = make_plan(scene, settings, args.aov, crop=args.crop)
     if args.json:
         print(json_text(plan.as_dict(), indent=2))
     else:
@@ -40,23 +40,32 @@ def _show_plan(plan: Plan) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    stages = Table("stage", "runs", "why", "kernels", title="Stages", title_justify="left")
-    buffers = Table("buffer", "stage", "what it holds", title="Buffers", title_justify="left")
-    buffers.add_column("bytes", justify="right")
+    stages = Table("stage", "why", "kernels", title="Stages", title_justify="left")
     for stage in plan.stages:
-        stages.add_row(
-            stage.name, "yes" if stage.planned else "no", stage.reason, " ".join(stage.kernels)
-        )
-        if stage.planned:
-            for buffer in stage.buffers:
-                buffers.add_row(buffer.name, stage.name, buffer.what, f"{buffer.bytes:,}")
-    buffers.add_section()
-    buffers.add_row("sum", "", f"{plan.total_bytes / 2**20:.1f} MiB", f"{plan.total_bytes:,}")
+        stages.add_row(stage.name, stage.reason, " ".join(stage.kernels))
 
-    features = Table("feature", "value", title="Compiled for", title_justify="left")
-    for name, value in plan.features.items():
-        features.add_row(name, {True: "yes", False: "no"}[value] if value in (0, 1) else str(value))
+    features = Table("macro", "value", "why", title="Compiled for", title_justify="left")
+    for name, feature in plan.features.items():
+        if feature.value:
+            features.add_row(name, str(feature.value), feature.reason)
+    # What is off among the features is here too.
     left_out = Table("left out", "why", title="Left out", title_justify="left")
     for name, reason in plan.left_out:
         left_out.add_row(name, reason)
-    show(stages, Text(), features, Text(), left_out, Text(), buffers)
+
+    buffers = Table("buffer", "of", "what it holds", title="Buffers", title_justify="left")
+    buffers.add_column("bytes", justify="right")
+    owners = [("scene", plan.scene_buffers), *((s.name, s.buffers) for s in plan.stages)]
+    for owner, specs in owners:
+        for buffer in specs:
+            buffers.add_row(buffer.name, owner, buffer.what, f"{buffer.bytes:,}")
+    buffers.add_section()
+    buffers.add_row("sum", "", f"{plan.total_bytes / 2**20:.1f} MiB", f"{plan.total_bytes:,}")
+
+    width, height = plan.crop[2:]
+    traits = plan.traits
+    pool = (
+        f"{width}x{height} pixels; for a {traits.kind.upper()}: {traits.slots} paths in flight, "
+        f"{traits.lanes} a work item, from at most {plan.ring} passes"
+    )
+    show(pool, Text(), stages, Text(), features, Text(), left_out, Text(), buffers)

@@ -9,11 +9,13 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from psf_cl.cli.common import (
+    START,
     add_scene_arguments,
     exposure_argument,
     load_with_settings,
@@ -79,8 +81,6 @@ def run(args: argparse.Namespace) -> int:
         check_writable(path)
     scene, settings = load_with_settings(args)
     reference = _reference(args, scene) if args.reference else None
-    if not args.quiet:
-        tell_notes(scene)
 
     try:
         from psf_cl.device.device import open_device
@@ -88,9 +88,10 @@ def run(args: argparse.Namespace) -> int:
     except ImportError as error:
         raise DeviceError(f"no OpenCL ({error}); psf-cl doctor says what to do") from error
 
-    renderer = Renderer(
-        scene, settings, device=open_device(args.device), outputs=args.aov, crop=args.crop
-    )
+    device = open_device(args.device)
+    if not args.quiet:
+        tell_notes(scene)
+    renderer = Renderer(scene, settings, device, outputs=args.aov, crop=args.crop)
     with contextlib.closing(renderer):
         curve = ErrorCurve(reference)
         with stop_on_interrupt() as interrupted, ProgressDisplay(args.quiet) as display:
@@ -103,19 +104,19 @@ def run(args: argparse.Namespace) -> int:
             spp = None if args.seconds else args.spp or DEFAULT_SPP
             renderer.render(spp=spp, seconds=args.seconds, progress=on_progress)
             stopped = interrupted()
-        stats = renderer.stats()
-        if stopped and not stats["spp"]:
-            raise KeyboardInterrupt
         image = renderer.image()
-    stats["scene"] = scene.path
+        stats = image.stats
+        if not stats["spp"] and not renderer.snapshot(("rgb", "samples")).aovs["samples"].any():
+            raise KeyboardInterrupt
     if reference is not None:
-        curve.add(stats["render_seconds"], stats["spp"], image.rgb)
+        if stats["spp"]:
+            curve.add(stats["render_seconds"], stats["spp"], image.rgb)
         stats["error"] = curve.points
-    image.stats = stats
 
     write_exr(exr, image, args.half)
     write_png(png, image, args.exposure)
     if args.stats:
+        stats["process_seconds"] = time.perf_counter() - START
         write_whole(args.stats, (json_text(stats, indent=2) + "\n").encode())
     if not args.quiet:
         print(_summary(exr, image))
@@ -212,7 +213,8 @@ def _summary(path: Path, image: Image) -> str:
     spp, seconds = stats["spp"], stats["render_seconds"]
     samples = image.width * image.height * spp
     rate = samples / seconds / 1e6 if seconds > 0.0 else math.inf
-    text = f"{path}: {spp} spp in {seconds:.2f} s, {rate:.2f} Msamples/s"
+    count = f"{spp} spp" if spp else "part of the first pass"
+    text = f"{path}: {count} in {seconds:.2f} s, {rate:.2f} Msamples/s"
     if stats.get("error"):
         last = stats["error"][-1]
         text += f", relMSE {last['relmse']:.4g}, trimmed {last['relmse_trimmed']:.4g}"

@@ -163,11 +163,11 @@ class _Build:
         self.allocate("spare_codes", np.uint64, count)
         self.allocate("spare_triangles", np.uint32, count)
         names = ("codes", "triangles", "spare_codes", "spare_triangles")
-        buffers = [self.own.pop(name) for name in names]
-        codes, triangles = self.primitives.sort(*buffers, count, _CODE_BITS)
-        if codes is buffers[2]:
-            buffers = [*buffers[2:], *buffers[:2]]
-        self.own |= zip(names, buffers, strict=True)
+        codes, _ = self.primitives.sort(*(self.own[name] for name in names), count, _CODE_BITS)
+        if codes is self.own["spare_codes"]:
+            for name in names[:2]:
+                spare = f"spare_{name}"
+                self.own[name], self.own[spare] = self.own[spare], self.own[name]
         self.release("spare_codes", "spare_triangles")
 
     def find_binary_tree(self) -> None:

@@ -49,7 +49,8 @@ class Device:
 
     Attributes:
         traits: what the kernels are specialised to.
-        profiling: whether every launch keeps its event (``Program.bind``).
+        profiling: whether every launch keeps its event until it is collected.
+        totals: launches, seconds and items of each kernel (profiling only).
     """
 
     def __init__(self, device: cl.Device, traits: DeviceTraits, profiling: bool = False) -> None:
@@ -64,6 +65,7 @@ class Device:
         self.compile_seconds = 0.0
         self.programs: dict[tuple[Any, ...], Program] = {}
         self.events: list[tuple[str, int, cl.Event]] = []
+        self.totals: dict[str, tuple[int, float, int]] = {}
 
     @property
     def name(self) -> str:
@@ -85,7 +87,8 @@ class Device:
         limit = self.cl_device.max_mem_alloc_size
         if size > limit:
             raise DeviceError(
-                f"{name} needs {size / 2**20:.0f} MiB; {self.name} allows {limit / 2**20:.0f} MiB in one buffer"
+                f"{name} needs {size / 2**20:.0f} MiB; "
+                f"{self.name} allows {limit / 2**20:.0f} MiB in one buffer"
             )
         try:
             memory = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, size)
@@ -169,16 +172,13 @@ class Device:
         except cl.Error as error:
             raise DeviceError(f"{self.name} failed: {error}") from error
 
-    def stage_seconds(self) -> dict[str, tuple[int, float, int]]:
-        """Return launches, seconds and items per kernel since the last call (profiling only)."""
-        self.wait()
-        totals: dict[str, tuple[int, float, int]] = {}
+    def collect_events(self) -> None:
+        """Add the events of finished launches to ``totals``; call after everything is done."""
         for name, items, event in self.events:
-            launches, seconds, done = totals.get(name, (0, 0.0, 0))
+            launches, seconds, done = self.totals.get(name, (0, 0.0, 0))
             spent = (event.profile.end - event.profile.start) * 1e-9
-            totals[name] = (launches + 1, seconds + spent, done + items)
+            self.totals[name] = (launches + 1, seconds + spent, done + items)
         self.events.clear()
-        return totals
 
     def timed_compile(self, work: Any) -> Any:
         """Call ``work()`` and add its time to ``compile_seconds``."""

@@ -44,7 +44,7 @@ def assemble(file: str, folder: Path | None = None) -> str:
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
             match = _INCLUDE.match(line)
             if match is None:
-                # Includes are expanded once anyway, and compilers warn of the pragma in a main file.
+                # Includes are expanded once anyway; compilers warn of the pragma in a main file.
                 lines.append("" if line.strip() == "#pragma once" else line)
                 continue
             target = (path.parent / match.group(1)).resolve()

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from psf_cl.errors import InputError
-from psf_cl.scene.input_file import read_file
+from psf_cl.files import read_file
+from psf_cl.image import read_exr
 
 SUFFIXES = (".exr", ".hdr")
 MAX_PIXELS = 1 << 27
@@ -27,8 +28,11 @@ def load_environment(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise InputError(f"{path}: expected an environment image, {' or '.join(SUFFIXES)}")
-    data = read_file(path)
-    radiance = _read_exr(path, data) if suffix == ".exr" else _read_hdr(path, data)
+    if suffix == ".exr":
+        radiance = read_exr(path).rgb
+        _check_size(path, radiance.shape[1], radiance.shape[0])
+    else:
+        radiance = _read_hdr(path, read_file(path))
     return _mended(path, radiance)
 
 
@@ -47,30 +51,6 @@ def _mended(path: Path, radiance: np.ndarray) -> tuple[np.ndarray, tuple[str, ..
         notes.append(f"{path}: {count} infinite texels are set to {brightest:g}.")
         radiance = np.where(infinite, np.float32(brightest), radiance)
     return np.where(dark, np.float32(0), radiance), tuple(notes)
-
-
-def _read_exr(path: Path, data: bytes) -> np.ndarray:
-    import OpenEXR  # loads slowly, and most scenes have no environment image
-
-    if data[:4] != b"\x76\x2f\x31\x01":
-        raise InputError(f"{path}: not an OpenEXR file")
-    try:
-        # The header first: reading allocates whatever size a broken header claims.
-        header = OpenEXR.File(str(path), header_only=True).header()
-        (left, top), (right, bottom) = header["dataWindow"]
-        _check_size(path, int(right) - int(left) + 1, int(bottom) - int(top) + 1)
-        channels = OpenEXR.File(str(path), separate_channels=True).channels()
-        names = ("R", "G", "B") if "R" in channels else ("Y", "Y", "Y")
-        missing = set(names) - set(channels)
-        if missing:
-            known = ", ".join(channels) or "none"
-            raise InputError(f"{path}: expected channels R, G, B or Y; got {known}")
-        planes = [np.asarray(channels[name].pixels, np.float32) for name in names]
-    except (RuntimeError, ValueError, TypeError, KeyError, MemoryError) as error:
-        raise InputError(f"{path}: broken OpenEXR file: {' '.join(str(error).split())}") from None
-    if len({plane.shape for plane in planes}) != 1 or planes[0].ndim != 2:
-        raise InputError(f"{path}: subsampled or deep channels are not supported")
-    return np.stack(planes, axis=-1)
 
 
 def _check_size(path: Path, width: int, height: int) -> None:

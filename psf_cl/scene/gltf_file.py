@@ -22,7 +22,7 @@ from urllib.parse import unquote, unquote_to_bytes
 import numpy as np
 
 from psf_cl.errors import InputError
-from psf_cl.scene.input_file import read_file
+from psf_cl.files import read_file
 
 # JSON numbers end up in float32 on the device.
 MAX_NUMBER = float(np.finfo(np.float32).max)

@@ -88,9 +88,7 @@ def _with_camera(scene: Scene, name: str | None) -> Scene:
     if scene.cameras:
         return scene
     note = "The file has no camera: the view frames the whole scene."
-    return replace(
-        scene, cameras=(framing_camera(scene),), camera=0, notes=(*scene.notes, note)
-    )
+    return replace(scene, cameras=(framing_camera(scene),), camera=0, notes=(*scene.notes, note))
 
 
 def framing_camera(scene: Scene) -> Camera:

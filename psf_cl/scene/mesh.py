@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from psf_cl.errors import InputError
-from psf_cl.scene.input_file import read_file
+from psf_cl.files import read_file
 from psf_cl.scene.model import Material, Mesh, Scene, Shape, Texture
 from psf_cl.scene.texture import load_texture
 

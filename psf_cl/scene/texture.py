@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from psf_cl.errors import InputError
-from psf_cl.scene.input_file import read_file
+from psf_cl.files import read_file
 from psf_cl.scene.model import Texture
 
 # Formats that textures come in; Pillow's other readers, some of which start programs, stay shut.

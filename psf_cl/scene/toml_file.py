@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from psf_cl.errors import InputError
+from psf_cl.files import read_file
 from psf_cl.scene import transform
 from psf_cl.scene.environment import load_environment
-from psf_cl.scene.input_file import read_file
 from psf_cl.scene.model import Camera, Environment, Light, Material, Mesh, Scene, Shape, Texture
 from psf_cl.scene.primitives import PRIMITIVES
 from psf_cl.scene.schema import (

@@ -1,0 +1,286 @@
+"""The BSDF in double precision, written for clarity from the papers, and its integrals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Bsdf:
+    """Parameters as a scene gives them.
+
+    Attributes:
+        ior: of the inside; ``entering`` says whether wo is outside.
+    """
+
+    base_color: tuple[float, float, float] = (0.8, 0.5, 0.2)
+    roughness: float = 0.5
+    metallic: float = 0.0
+    specular: float = 1.0
+    transmission: float = 0.0
+    ior: float = 1.5
+    entering: bool = True
+
+    @property
+    def alpha(self) -> float:
+        return max(self.roughness**2, 1e-3)
+
+    @property
+    def eta(self) -> float:
+        """Index on the far side over the index on wo's side."""
+        return self.ior if self.entering else 1 / self.ior
+
+    @property
+    def f0(self) -> float:
+        return ((self.ior - 1) / (self.ior + 1)) ** 2 * self.specular
+
+    def record(self) -> list[float]:
+        return [
+            *self.base_color,
+            self.metallic,
+            self.alpha,
+            self.f0,
+            self.specular,
+            self.transmission,
+            self.eta,
+        ]
+
+
+def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return (a * b).sum(axis=-1)
+
+
+def unit(v: np.ndarray) -> np.ndarray:
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def fresnel(cosine: np.ndarray, eta: float) -> np.ndarray:
+    """Reflectance of unpolarised light by Snell's law and Fresnel's equations."""
+    theta = np.arccos(np.clip(cosine, 0, 1))
+    sine = np.sin(theta) / eta
+    refracted = np.arcsin(np.minimum(sine, 1))
+    n1, n2 = 1.0, eta
+    s = (n1 * np.cos(theta) - n2 * np.cos(refracted)) / (
+        n1 * np.cos(theta) + n2 * np.cos(refracted)
+    )
+    p = (n1 * np.cos(refracted) - n2 * np.cos(theta)) / (
+        n1 * np.cos(refracted) + n2 * np.cos(theta)
+    )
+    return np.where(sine >= 1, 1.0, (s**2 + p**2) / 2)
+
+
+def schlick(f0, f90, cosine):
+    """Schlick: An Inexpensive BRDF Model for Physically-based Rendering, 1994."""
+    return f0 + (f90 - f0) * (1 - np.clip(cosine, 0, 1)) ** 5
+
+
+def dielectric(b: Bsdf, cosine: np.ndarray) -> np.ndarray:
+    """Schlick where opaque, Fresnel where clear."""
+    opaque = schlick(b.f0, b.specular, cosine)
+    clear = fresnel(cosine, b.eta) * b.specular
+    return (1 - b.transmission) * opaque + b.transmission * clear
+
+
+def ggx(h: np.ndarray, alpha: float) -> np.ndarray:
+    """Density of normals; Walter et al.: Microfacet Models for Refraction, 2007, equation 33."""
+    tan2 = (h[..., 0] ** 2 + h[..., 1] ** 2) / h[..., 2] ** 2
+    return alpha**2 / (np.pi * h[..., 2] ** 4 * (alpha**2 + tan2) ** 2)
+
+
+def smith_lambda(w: np.ndarray, alpha: float) -> np.ndarray:
+    """Heitz: Understanding the Masking-Shadowing Function, 2014, equation 72."""
+    tan2 = (w[..., 0] ** 2 + w[..., 1] ** 2) / w[..., 2] ** 2
+    return (np.sqrt(1 + alpha**2 * tan2) - 1) / 2
+
+
+def masking_shadowing(wo: np.ndarray, wi: np.ndarray, alpha: float) -> np.ndarray:
+    """Height-correlated; Heitz 2014, equation 99."""
+    return 1 / (1 + smith_lambda(wo, alpha) + smith_lambda(wi, alpha))
+
+
+def eval_reflection(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
+    """Microfacet reflection times cosine, ``(..., 3)``; 0 below the horizon."""
+    h = unit(wo + wi)
+    cosine = dot(wo, h)
+    base = np.array(b.base_color)
+    metal = schlick(base, 1.0, cosine[..., None])
+    f = (1 - b.metallic) * dielectric(b, cosine)[..., None] + b.metallic * metal
+    with np.errstate(all="ignore"):
+        g = masking_shadowing(wo, wi, b.alpha)
+        value = ggx(h, b.alpha) * g / (4 * wo[..., 2] * wi[..., 2]) * wi[..., 2]
+    return np.where(wi[..., 2:] > 0, f * value[..., None], 0)
+
+
+def eval_diffuse(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
+    h = unit(wo + wi)
+    below = (1 - b.metallic) * (1 - b.transmission) * (1 - dielectric(b, dot(wo, h)))
+    value = below * np.maximum(wi[..., 2], 0) / np.pi
+    return value[..., None] * np.array(b.base_color)
+
+
+def refraction_normal(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
+    """Walter 2007, equation 16, turned to wo's side."""
+    h = unit(-(wo + b.eta * wi))
+    return h * np.sign(h[..., 2:])
+
+
+def eval_refraction(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
+    """Walter 2007, equation 21, times cosine, for radiance (which carries 1 / eta^2), ``(..., 3)``."""
+    with np.errstate(all="ignore"):
+        h = refraction_normal(b, wo, wi)
+        oh, ih = dot(wo, h), dot(wi, h)
+        # Equation 21 with wo as its i (index 1) and wi as its o (index eta).
+        bent = np.abs(oh * ih) / np.abs(wo[..., 2] * wi[..., 2])
+        bent = bent * b.eta**2 / (oh + b.eta * ih) ** 2
+        mirrored = wi * np.array([1, 1, -1])
+        value = bent * (1 - b.specular * fresnel(oh, b.eta)) * ggx(h, b.alpha)
+        value = value * masking_shadowing(wo, mirrored, b.alpha) * np.abs(wi[..., 2]) / b.eta**2
+    value = value * (1 - b.metallic) * b.transmission
+    meets = (wi[..., 2] < 0) & (oh > 0) & (ih < 0)
+    return np.where(meets, value, 0)[..., None] * np.array(b.base_color)
+
+
+def evaluate(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
+    """f times |cos wi|, ``(..., 3)``."""
+    return eval_reflection(b, wo, wi) + eval_diffuse(b, wo, wi) + eval_refraction(b, wo, wi)
+
+
+def pdf_reflection(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
+    """Eto, Tokuyoshi: Bounded VNDF Sampling for Smith-GGX Reflections, 2023, listing 2."""
+    h = unit(wo + wi)
+    a2 = b.alpha**2
+    sine2 = wo[..., 0] ** 2 + wo[..., 1] ** 2
+    s = 1 + np.sqrt(sine2)
+    k = (1 - a2) * s**2 / (s**2 + a2 * wo[..., 2] ** 2)
+    t = np.sqrt(a2 * sine2 + wo[..., 2] ** 2)
+    return np.where(wi[..., 2] > 0, ggx(h, b.alpha) / (2 * (k * wo[..., 2] + t)), 0)
+
+
+def pdf_refraction(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
+    """Visible normals (Heitz 2014, equation 16), by Walter 2007, equation 17."""
+    with np.errstate(all="ignore"):
+        h = refraction_normal(b, wo, wi)
+        oh, ih = dot(wo, h), dot(wi, h)
+        visible = ggx(h, b.alpha) * oh / (1 + smith_lambda(wo, b.alpha)) / wo[..., 2]
+        pdf = visible * b.eta**2 * np.abs(ih) / (oh + b.eta * ih) ** 2
+    return np.where((wi[..., 2] < 0) & (oh > 0) & (ih < 0), pdf, 0)
+
+
+def pdf_diffuse(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
+    return np.maximum(wi[..., 2], 0) / np.pi
+
+
+def reflect(wo: np.ndarray, h: np.ndarray) -> np.ndarray:
+    return 2 * dot(wo, h)[..., None] * h - wo
+
+
+def refract(wo: np.ndarray, h: np.ndarray, eta: float) -> np.ndarray:
+    """Snell's law; (0, 0, 0) under total reflection."""
+    oh = dot(wo, h)
+    cos2 = 1 - (1 - oh**2) / eta**2
+    along = oh / eta - np.sqrt(np.maximum(cos2, 0))
+    bent = -wo / eta + along[..., None] * h
+    return np.where(((cos2 > 0) & (oh > 0))[..., None], bent, 0)
+
+
+def normal_at(t: np.ndarray, phi: np.ndarray, alpha: float) -> np.ndarray:
+    """Microfacet normal with tan(theta) = alpha sqrt(t / (1 - t)): GGX is about uniform in t."""
+    slope = alpha * np.sqrt(t / (1 - t))
+    return unit(np.stack([slope * np.cos(phi), slope * np.sin(phi), np.ones_like(t)], axis=-1))
+
+
+def place_of(h: np.ndarray, alpha: float) -> tuple[np.ndarray, np.ndarray]:
+    """The inverse of normal_at: t in [0, 1) and phi in [0, 2 pi)."""
+    slope2 = (h[..., 0] ** 2 + h[..., 1] ** 2) / h[..., 2] ** 2 / alpha**2
+    return slope2 / (1 + slope2), np.arctan2(h[..., 1], h[..., 0]) % (2 * np.pi)
+
+
+class Lobe:
+    """One lobe as a map from the unit square, with the solid angle that a cell of it covers.
+
+    The solid angles come from differences of the map itself, so that no analytic Jacobian is
+    shared with what is tested.
+
+    Args:
+        kind: "reflect", "refract" or "diffuse".
+        cells: bins along each side.
+        fine: quadrature points along each side of a bin.
+    """
+
+    def __init__(self, kind: str, b: Bsdf, wo: np.ndarray, cells: int = 12, fine: int = 24) -> None:
+        self.kind, self.b, self.wo, self.cells = kind, b, np.asarray(wo, np.float64), cells
+        points = (np.arange(cells * fine) + 0.5) / (cells * fine)
+        s, t = np.meshgrid(points, points, indexing="ij")
+        step = 1e-6
+        across = self.direction(s + step, t) - self.direction(s - step, t)
+        along = self.direction(s, t + step) - self.direction(s, t - step)
+        area = np.linalg.norm(np.cross(across, along), axis=-1) / (2 * step) ** 2
+        self.wi = self.direction(s, t)
+        weight = 1 / (cells * fine) ** 2
+        self.solid_angle = np.where(self.mask(self.wi), area * weight, 0)
+
+    def mask(self, wi: np.ndarray) -> np.ndarray:
+        return wi[..., 2] < 0 if self.kind == "refract" else wi[..., 2] > 0
+
+    def direction(self, s: np.ndarray, t: np.ndarray) -> np.ndarray:
+        if self.kind == "diffuse":
+            radius, phi = np.sqrt(s), 2 * np.pi * t
+            return np.stack(
+                [radius * np.cos(phi), radius * np.sin(phi), np.sqrt(np.maximum(1 - s, 0))], axis=-1
+            )
+        # Squared at the end: normals near the horizon are seen from grazing directions.
+        h = normal_at(1 - (1 - s) ** 2, 2 * np.pi * t, self.b.alpha)
+        return reflect(self.wo, h) if self.kind == "reflect" else refract(self.wo, h, self.b.eta)
+
+    def bin_of(self, wi: np.ndarray) -> np.ndarray:
+        """Index of the bin that each direction is in, ``cells^2`` for one that is not of the lobe."""
+        wi = np.asarray(wi, np.float64)
+        with np.errstate(all="ignore"):
+            if self.kind == "diffuse":
+                s = wi[..., 0] ** 2 + wi[..., 1] ** 2
+                phi = np.arctan2(wi[..., 1], wi[..., 0]) % (2 * np.pi)
+            else:
+                h = (
+                    unit(self.wo + wi)
+                    if self.kind == "reflect"
+                    else refraction_normal(self.b, self.wo, wi)
+                )
+                t, phi = place_of(h, self.b.alpha)
+                s = 1 - np.sqrt(np.maximum(1 - t, 0))
+        inside = self.mask(wi) & np.isfinite(s)
+        row = np.clip(np.where(inside, s, 0) * self.cells, 0, self.cells - 1).astype(int)
+        column = np.clip(phi / (2 * np.pi) * self.cells, 0, self.cells - 1)
+        column = np.where(inside, column, 0).astype(int)
+        return np.where(inside, row * self.cells + column, self.cells**2)
+
+    def integrate(self, function) -> np.ndarray:
+        """Return the integral of ``function(b, wo, wi)`` over each bin, ``(cells^2, ...)``."""
+        with np.errstate(all="ignore"):
+            values = np.asarray(function(self.b, self.wo, self.wi))
+        extra = values.ndim - 2
+        weights = self.solid_angle.reshape(self.solid_angle.shape + (1,) * extra)
+        values = np.where(weights > 0, values * weights, 0)
+        n = self.cells
+        fine = values.shape[0] // n
+        binned = values.reshape(n, fine, n, fine, *values.shape[2:]).sum(axis=(1, 3))
+        return binned.reshape(n * n, *values.shape[2:])
+
+
+PDFS = {"reflect": pdf_reflection, "refract": pdf_refraction, "diffuse": pdf_diffuse}
+VALUES = {"reflect": eval_reflection, "refract": eval_refraction, "diffuse": eval_diffuse}
+
+
+def albedo(b: Bsdf, wo: np.ndarray) -> np.ndarray:
+    """Return the integral of f |cos| over all directions by quadrature, ``(3,)``."""
+    kinds = ["reflect"]
+    kinds += ["diffuse"] if b.metallic < 1 and b.transmission < 1 else []
+    kinds += ["refract"] if b.metallic < 1 and b.transmission > 0 else []
+    return sum(
+        Lobe(kind, b, wo, cells=1, fine=400).integrate(VALUES[kind])[0] for kind in kinds
+    )
+
+
+def white(b: Bsdf) -> Bsdf:
+    return replace(b, base_color=(1.0, 1.0, 1.0))

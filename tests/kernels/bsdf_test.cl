@@ -1,0 +1,83 @@
+// The functions of bsdf.h, one material and one pair of directions a lane.
+//
+// materials: base colour (3), metallic, alpha, f0, specular, transmission, eta.
+// chances: reflect, refract, diffuse; of lobe_chances if the first is negative.
+
+#include "planes.h"
+#include "../../cl/common/bsdf.h"
+
+static inline Bsdf load_bsdf(global const float *materials)
+{
+    Bsdf b;
+    b.base_color = LOAD_V(materials, 0);
+    b.metallic = LOAD(materials, 3);
+    b.alpha = LOAD(materials, 4);
+    b.f0 = LOAD(materials, 5);
+    b.specular = LOAD(materials, 6);
+#if TRANSMISSION
+    b.transmission = LOAD(materials, 7);
+    b.eta = LOAD(materials, 8);
+#endif
+    return b;
+}
+
+static inline LobeChances load_chances(global const float *chances, Bsdf b, Float cos_o)
+{
+    LobeChances c = lobe_chances(b, cos_o);
+    const Mask given = LOAD(chances, 0) >= 0.0f;
+    c.reflect = pick(given, LOAD(chances, 0), c.reflect);
+#if TRANSMISSION
+    c.refract = pick(given, LOAD(chances, 1), c.refract);
+#endif
+    c.diffuse = pick(given, LOAD(chances, 2), c.diffuse);
+    return c;
+}
+
+kernel void list_chances(global const float *materials, global const float *wo, global float *chances)
+{
+    const LobeChances c = lobe_chances(load_bsdf(materials), LOAD(wo, 2));
+    STORE(chances, 0, c.reflect);
+#if TRANSMISSION
+    STORE(chances, 1, c.refract);
+#else
+    STORE(chances, 1, (Float)(0.0f));
+#endif
+    STORE(chances, 2, c.diffuse);
+}
+
+kernel void eval_pairs(
+    global const float *materials,
+    global const float *given,
+    global const float *wo,
+    global const float *wi,
+    global const float *side,
+    global float *values,
+    global float *pdfs)
+{
+    const Bsdf b = load_bsdf(materials);
+    const Vec3 o = LOAD_V(wo, 0);
+    Float pdf;
+    store_vec3(values, 0, eval_bsdf(b, load_chances(given, b, o.z), o, LOAD_V(wi, 0), LOAD(side, 0), &pdf));
+    STORE(pdfs, 0, pdf);
+}
+
+/// numbers: u_lobe, u1, u2.
+kernel void sample_directions(
+    global const float *materials,
+    global const float *given,
+    global const float *wo,
+    global const float *numbers,
+    global float *wi,
+    global float *values,
+    global float *pdfs)
+{
+    const Bsdf b = load_bsdf(materials);
+    const Vec3 o = LOAD_V(wo, 0);
+    const LobeChances c = load_chances(given, b, o.z);
+    const Vec3 i = sample_bsdf(b, c, o, LOAD(numbers, 0), LOAD(numbers, 1), LOAD(numbers, 2));
+    Float pdf;
+    const Vec3 value = eval_bsdf(b, c, o, i, i.z, &pdf);
+    store_vec3(wi, 0, i);
+    store_vec3(values, 0, value);
+    STORE(pdfs, 0, pdf);
+}

@@ -1,0 +1,349 @@
+"""The BSDF: formulas against double precision, sampling against its density, energy, reciprocity."""
+
+from functools import cache
+
+import bsdf_truth as truth
+import numpy as np
+import planes
+import pytest
+from bsdf_truth import Bsdf, Lobe
+from scipy import stats
+
+P_MIN = 1e-4
+BY_CHANCE = (-1.0, -1.0, -1.0)
+ONLY = {"reflect": (1.0, 0.0, 0.0), "refract": (0.0, 1.0, 0.0), "diffuse": (0.0, 0.0, 1.0)}
+
+MATERIALS = {
+    "lambert": Bsdf(specular=0.0, roughness=1.0),
+    "plastic": Bsdf(roughness=0.3),
+    "rough plastic": Bsdf(roughness=1.0, ior=2.4),
+    "half coat": Bsdf(roughness=0.4, specular=0.5),
+    "metal": Bsdf(roughness=0.5, metallic=1.0),
+    "polished metal": Bsdf(roughness=0.05, metallic=1.0),
+    "half metal": Bsdf(roughness=0.7, metallic=0.5),
+    "glass": Bsdf(roughness=0.3, transmission=1.0),
+    "glass from inside": Bsdf(roughness=0.3, transmission=1.0, entering=False),
+    "rough water": Bsdf(roughness=0.8, transmission=1.0, ior=1.3),
+    "diamond from inside": Bsdf(roughness=0.5, transmission=1.0, ior=2.4, entering=False),
+    "fogged": Bsdf(roughness=0.6, transmission=0.5),
+    "everything": Bsdf(roughness=0.5, metallic=0.4, transmission=0.3, specular=0.6),
+}
+
+
+def direction(cosine, phi=0.4):
+    sine = np.sqrt(1 - cosine**2)
+    return np.array([sine * np.cos(phi), sine * np.sin(phi), cosine])
+
+
+def run(device, kernel, inputs, outputs, transmission=1):
+    inputs = {name: np.ascontiguousarray(v, np.float32) for name, v in inputs.items()}
+    defines = {"TRANSMISSION": transmission}
+    return planes.run(device, "bsdf_test.cl", kernel, inputs, outputs, defines)
+
+
+def sample(device, records, given, wo, numbers, transmission=1):
+    """Return directions ``(n, 3)``, values ``(n, 3)`` and densities ``(n,)``; all arguments ``(n, k)``."""
+    wi, values, pdfs = run(
+        device,
+        "sample_directions",
+        {"materials": records.T, "given": given.T, "wo": wo.T, "numbers": numbers.T},
+        {"wi": (np.float32, 3), "values": (np.float32, 3), "pdfs": (np.float32, 1)},
+        transmission,
+    )
+    return wi.T, values.T, pdfs
+
+
+def evaluate(device, records, given, wo, wi, side=None, transmission=1):
+    """Return values ``(n, 3)`` and densities ``(n,)``."""
+    side = wi[:, 2] if side is None else side
+    values, pdfs = run(
+        device,
+        "eval_pairs",
+        {"materials": records.T, "given": given.T, "wo": wo.T, "wi": wi.T, "side": side},
+        {"values": (np.float32, 3), "pdfs": (np.float32, 1)},
+        transmission,
+    )
+    return values.T, pdfs
+
+
+def chances(device, records, wo, transmission=1):
+    """Return the chances to reflect, refract and scatter, ``(n, 3)``."""
+    inputs = {"materials": records.T, "wo": wo.T}
+    return run(
+        device, "list_chances", inputs, {"chances": (np.float32, 3)}, transmission
+    )[0].T
+
+
+def cases_in_turn(cases, count, seed):
+    """Return arrays in which the lanes of a work item belong to different cases.
+
+    Args:
+        cases: tuples of a Bsdf, chances and wo.
+
+    Returns:
+        Materials, chances, wo and random numbers, each ``(count * len(cases), k)``.
+    """
+    records = np.tile([b.record() for b, _, _ in cases], (count, 1))
+    given = np.tile([c for _, c, _ in cases], (count, 1))
+    wo = np.tile([o for _, _, o in cases], (count, 1))
+    numbers = np.random.default_rng(seed).integers(0, 1 << 24, (len(records), 3)) / 2.0**24
+    return records, given, wo, numbers
+
+
+def random_pairs(count, seed):
+    """Return Bsdfs that differ from each other, wo and wi, ``(count, 3)``, also grazing ones."""
+    rng = np.random.default_rng(seed)
+
+    def often(*values):
+        return values[k] if (k := rng.integers(len(values) + 2)) < len(values) else rng.random()
+
+    bsdfs = [
+        Bsdf(
+            base_color=tuple(rng.random(3)),
+            roughness=often(0.05, 0.2, 1.0),
+            metallic=often(0.0, 1.0),
+            specular=often(0.0, 1.0),
+            transmission=often(0.0, 1.0),
+            ior=float(rng.choice([1.3, 1.5, 2.4])),
+            entering=bool(rng.random() < 0.5),
+        )
+        for _ in range(count)
+    ]
+    wo, wi = rng.normal(size=(2, count, 3))
+    wo[:, 2] = abs(wo[:, 2])
+    wo[::7, 2] *= 0.01
+    wi[::5, 2] *= 0.01
+    as_device = np.float32
+    return bsdfs, truth.unit(wo).astype(as_device), truth.unit(wi).astype(as_device)
+
+
+@pytest.mark.parametrize("opaque", [False, True], ids=["transmission", "opaque build"])
+def test_values_and_densities_equal_the_papers(lane_device, opaque):
+    count = 3000
+    bsdfs, wo, wi = random_pairs(count, 1)
+    if opaque:
+        bsdfs = [truth.replace(b, transmission=0.0) for b in bsdfs]
+    records = np.array([b.record() for b in bsdfs])
+    by_chance = np.full((count, 3), -1.0)
+    build = 0 if opaque else 1
+    # Half of the pairs at random, half where the BSDF has its peaks.
+    numbers = np.random.default_rng(2).random((count, 3))
+    drawn, _, _ = sample(lane_device, records, by_chance, wo, numbers, build)
+    half = count // 2
+    wi[:half] = np.where(np.isfinite(drawn[:half]) & (drawn[:half, 2:] != 0), drawn, wi)[:half]
+    values, pdfs = evaluate(lane_device, records, by_chance, wo, wi, transmission=build)
+    chance = chances(lane_device, records, wo, build)
+
+    o, i = wo.astype(np.float64), wi.astype(np.float64)
+    exact = np.array([truth.evaluate(*pair) for pair in zip(bsdfs, o, i, strict=True)])
+    pdf = np.array(
+        [
+            sum(c * truth.PDFS[kind](b, x, y) for kind, c in zip(ONLY, cs, strict=True))
+            for b, x, y, cs in zip(bsdfs, o, i, chance.astype(np.float64), strict=True)
+        ]
+    )
+    # A rounding of a direction is 1e-7, and a lobe as sharp as alpha turns it into 1e-7 / alpha;
+    # refraction at an index near 1 multiplies that by up to 1 / (eta - 1).
+    alpha = records[:, 4]
+    tolerance = 3e-5 + 4e-6 / alpha
+    error = abs(values - exact).max(axis=1) / (exact.max(axis=1) + 1e-5)
+    assert (error < tolerance).all(), (error / tolerance).max()
+    error = abs(pdfs - pdf) / (pdf + 1e-5)
+    assert (error < tolerance).all(), (error / tolerance).max()
+    assert (exact.max(axis=1) > 0).mean() > 0.5
+
+
+def test_chances_are_a_distribution_over_the_lobes_that_exist(lane_device):
+    bsdfs, wo, _ = random_pairs(2000, 3)
+    bsdfs[:10] = [Bsdf(base_color=(0, 0, 0), specular=0.0)] * 10
+    records = np.array([b.record() for b in bsdfs])
+    chance = chances(lane_device, records, wo)
+    np.testing.assert_allclose(chance.sum(axis=1), 1, atol=1e-6)
+    dielectric = np.array([b.metallic < 1 for b in bsdfs])
+    coated = np.array([b.specular > 0 or (b.metallic > 0 and max(b.base_color) > 0) for b in bsdfs])
+    clear = np.array([b.transmission > 0 for b in bsdfs])
+    opaque = np.array([b.transmission < 1 and max(b.base_color) > 0 for b in bsdfs])
+    # Where all is reflected, at the critical angle, nothing goes on.
+    total = np.array([truth.dielectric(b, o[2]) > 1 - 1e-5 for b, o in zip(bsdfs, wo, strict=True)])
+    exists = np.stack([coated, dielectric & clear & ~total, dielectric & opaque & ~total], axis=1)
+    certain = ~total
+    certain[:10] = False
+    np.testing.assert_array_equal((chance > 0)[certain], exists[certain])
+    assert (chance[exists] > 0.08).all()
+
+
+def lobe_cases():
+    cases = []
+    for roughness in (0.0, 0.05, 0.3, 0.6, 1.0):
+        for cosine in (1.0, 0.7, 0.15, 0.02):
+            cases.append(("reflect", Bsdf(roughness=roughness, metallic=1.0), direction(cosine)))
+    for ior in (1.3, 1.5, 2.4):
+        for entering in (True, False):
+            for roughness in (0.05, 0.4, 1.0):
+                b = Bsdf(roughness=roughness, transmission=1.0, ior=ior, entering=entering)
+                cases += [("refract", b, direction(cosine, 2.0)) for cosine in (0.95, 0.5, 0.05)]
+    cases.append(("diffuse", Bsdf(specular=0.0), direction(0.5)))
+    return cases
+
+
+@cache
+def expected_shares():
+    """Return the cases' lobes and the share of samples that each bin should have."""
+    made = [(Lobe(kind, b, wo), truth.PDFS[kind]) for kind, b, wo in lobe_cases()]
+    return [(lobe, lobe.integrate(pdf)) for lobe, pdf in made]
+
+
+def test_samples_of_every_lobe_follow_its_density(lane_device):
+    """Chi-square over bins in the lobe's own coordinates; failed draws are a bin of their own."""
+    count = 20000
+    cases = [(b, ONLY[kind], wo) for kind, b, wo in lobe_cases()]
+    drawn = sample(lane_device, *cases_in_turn(cases, count, seed=5))
+    wi, _, pdfs = (values.reshape(count, len(cases), -1) for values in drawn)
+    for k, (lobe, share) in enumerate(expected_shares()):
+        label = f"{lobe.kind} {lobe.b} cosine {lobe.wo[2]}"
+        assert share.sum() < 1.002, label
+        share = np.append(share, max(1 - share.sum(), 0))
+        index = np.where(pdfs[:, k, 0] > 0, lobe.bin_of(wi[:, k]), lobe.cells**2)
+        found = np.bincount(index, minlength=len(share))
+        # The last bin takes what is too rare for the test.
+        rare = share * count < 10
+        rare[-1] = True
+        expected = np.append(share[~rare], share[rare].sum())
+        found = np.append(found[~rare], found[rare].sum())
+        if expected[-1] * count < 10:
+            # Quadrature knows the sum to 0.2 %.
+            assert found[-1] < 10 + 0.002 * count, label
+            expected, found = expected[:-1], found[:-1]
+        p = stats.chisquare(found, expected / expected.sum() * found.sum()).pvalue
+        assert p > P_MIN, f"{label}: p = {p}"
+
+
+def test_failed_draws_are_as_many_as_the_density_lacks(lane_device):
+    count = 20000
+    cases = [(b, ONLY[kind], wo) for kind, b, wo in lobe_cases()]
+    _, _, pdfs = sample(lane_device, *cases_in_turn(cases, count, seed=6))
+    drawn = (pdfs.reshape(count, len(cases)) > 0).mean(axis=0)
+    total = np.array([share.sum() for _, share in expected_shares()])
+    deviation = np.sqrt(np.clip(total * (1 - total), 0, 1) / count)
+    assert (abs(drawn - total) < 5 * deviation + 0.002).all(), abs(drawn - total).max()
+
+
+@cache
+def expected_albedo(name, cosine):
+    return truth.albedo(MATERIALS[name], direction(cosine))
+
+
+@pytest.mark.parametrize("cosine", [0.98, 0.4, 0.08])
+def test_mean_weight_of_samples_is_the_integral(lane_device, cosine):
+    """E[f cos / pdf] with lobes drawn by their chances, against quadrature of f cos."""
+    count = 30000
+    cases = [(b, BY_CHANCE, direction(cosine)) for b in MATERIALS.values()]
+    drawn = sample(lane_device, *cases_in_turn(cases, count, seed=7))
+    _, values, pdfs = (v.astype(np.float64).reshape(count, len(cases), -1) for v in drawn)
+    weight = np.where(pdfs > 0, values / np.where(pdfs > 0, pdfs, 1), 0)
+    for k, name in enumerate(MATERIALS):
+        expected = expected_albedo(name, cosine)
+        deviation = weight[:, k].std(axis=0) / np.sqrt(count)
+        error = abs(weight[:, k].mean(axis=0) - expected)
+        assert (error < 4.5 * deviation + 1e-3 * expected).all(), f"{name}: {error} {expected}"
+
+
+def test_share_of_refracted_samples_is_the_chance_to_refract(lane_device):
+    """With the chances that lobe_chances gives, up to what is lost to total reflection."""
+    count = 20000
+    b = Bsdf(roughness=0.1, transmission=0.5, metallic=0.2)
+    cases = [(b, BY_CHANCE, direction(0.9)), (b, BY_CHANCE, direction(0.3))]
+    records, given, wo, numbers = cases_in_turn(cases, count, seed=8)
+    wi, _, _ = sample(lane_device, records, given, wo, numbers)
+    below = (wi[:, 2] < 0).reshape(count, 2).mean(axis=0)
+    chance = chances(lane_device, records[:2], wo[:2])[:, 1]
+    np.testing.assert_allclose(below, chance, rtol=0, atol=5 * 0.5 / np.sqrt(count))
+
+
+def test_reflection_is_reciprocal(lane_device):
+    bsdfs, wo, wi = random_pairs(3000, 9)
+    wi[:, 2] = abs(wi[:, 2])
+    records = np.array([b.record() for b in bsdfs])
+    given = np.full((len(bsdfs), 3), -1.0)
+    there, _ = evaluate(lane_device, records, given, wo, wi)
+    back, _ = evaluate(lane_device, records, given, wi, wo)
+    f, g = there / wi[:, 2:], back / wo[:, 2:]
+    tolerance = 1e-4 + 4e-6 / records[:, 4:5]
+    assert (abs(f - g) <= tolerance * (f + g) + 1e-6).all()
+
+
+def test_refraction_is_reciprocal_up_to_the_squared_index(lane_device):
+    """f(wo, wi) / n_o^2 = f(wi, wo) / n_i^2; Veach 1997, equation 5.12."""
+    bsdfs, wo, _ = random_pairs(3000, 10)
+    bsdfs = [truth.replace(b, transmission=1.0, roughness=max(b.roughness, 0.2)) for b in bsdfs]
+    records = np.array([b.record() for b in bsdfs])
+    numbers = np.random.default_rng(11).random((len(bsdfs), 3))
+    only = np.tile(ONLY["refract"], (len(bsdfs), 1))
+    wi, _, pdf = sample(lane_device, records, only, wo, numbers)
+    there, _ = evaluate(lane_device, records, only, wo, wi)
+    swapped = np.array([truth.replace(b, entering=not b.entering).record() for b in bsdfs])
+    back, _ = evaluate(lane_device, swapped, only, -wi, -wo)
+    ok = (pdf > 0) & (wi[:, 2] < -1e-3) & (wo[:, 2] > 1e-3)
+    assert ok.sum() > 1000
+    eta = records[:, 8:9]
+    f = (there / -wi[:, 2:] * eta**2)[ok]
+    g = (back / wo[:, 2:])[ok]
+    assert (abs(f - g) <= 2e-3 * (f + g) + 1e-6).all()
+
+
+def test_no_metal_glass_or_lambertian_reflects_more_than_it_receives(lane_device):
+    """A white one in a white furnace: the mean weight is an estimate of what comes back."""
+    count = 4000
+    bsdfs = [Bsdf(specular=0.0)]
+    for roughness in (0.05, 0.3, 0.6, 1.0):
+        bsdfs.append(Bsdf(roughness=roughness, metallic=1.0))
+        for ior in (1.3, 1.5, 2.4):
+            for entering in (True, False):
+                glass = Bsdf(roughness=roughness, transmission=1.0, ior=ior, entering=entering)
+                bsdfs.append(glass)
+    cosines = (1.0, 0.5, 0.15, 0.02)
+    cases = [(truth.white(b), BY_CHANCE, direction(c)) for b in bsdfs for c in cosines]
+    records, given, wo, numbers = cases_in_turn(cases, count, seed=12)
+    wi, values, pdfs = sample(lane_device, records, given, wo, numbers)
+    weight = np.where(pdfs > 0, values[:, 0] / np.where(pdfs > 0, pdfs, 1), 0)
+    # Radiance is compressed by 1 / eta^2 on its way into glass; power is not.
+    weight = np.where(wi[:, 2] < 0, weight * records[:, 8] ** 2, weight)
+    weight = weight.astype(np.float64).reshape(count, len(cases))
+    deviation = weight.std(axis=0) / np.sqrt(count)
+    over = weight.mean(axis=0) - 1 - 4 * deviation
+    assert over.max() < 1e-4, cases[int(over.argmax())]
+
+
+def test_weights_stay_finite_at_the_extremes(lane_device):
+    corners = [0.0, 2.0**-24, 0.5, 1 - 2.0**-24]
+    numbers = np.stack(np.meshgrid(corners, corners, corners), axis=-1).reshape(-1, 3)
+    bsdfs = [
+        Bsdf(base_color=color, roughness=r, metallic=m, specular=s, transmission=t, ior=n, entering=e)
+        for color in ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+        for r in (0.0, 0.05, 1.0)
+        for m in (0.0, 1.0)
+        for s in (0.0, 1.0)
+        for t in (0.0, 0.5, 1.0)
+        for n, e in ((1.001, True), (1.5, False), (2.4, True))
+    ]
+    cosines = (1.0, 0.3, 1e-3, 1e-6)
+    cases = [(b, BY_CHANCE, direction(c)) for b in bsdfs for c in cosines]
+    records = np.repeat([b.record() for b, _, _ in cases], len(numbers), axis=0)
+    given = np.full((len(records), 3), -1.0)
+    wo = np.repeat([o for _, _, o in cases], len(numbers), axis=0)
+    u = np.tile(numbers, (len(cases), 1))
+    wi, values, pdfs = sample(lane_device, records, given, wo, u)
+    assert np.isfinite(wi).all()
+    assert np.isfinite(values).all() and (values >= 0).all()
+    assert np.isfinite(pdfs).all() and (pdfs >= 0).all()
+    weight = np.where(pdfs > 0, values.max(axis=1) / np.where(pdfs > 0, pdfs, 1), 0)
+    # A lobe has at least a tenth of the samples; leaving glass multiplies by eta^2.
+    assert weight.max() < 12 * 2.4**2, cases[int(weight.argmax()) // len(numbers)]
+
+
+def test_nothing_crosses_the_real_surface_by_a_shading_normal(lane_device):
+    bsdfs, wo, wi = random_pairs(2000, 13)
+    records = np.array([b.record() for b in bsdfs])
+    given = np.full((len(bsdfs), 3), -1.0)
+    values, pdfs = evaluate(lane_device, records, given, wo, wi, side=-wi[:, 2])
+    assert not values.any() and not pdfs.any()
