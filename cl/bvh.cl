@@ -1,10 +1,11 @@
-// The tree, built in steps: Morton codes, a binary tree over the sorted triangles, blocks of up to four
-// triangles, boxes from the bottom up, wide nodes from the top down.
+// The tree, built in steps: Morton codes, a binary tree over the sorted triangles, blocks of up to
+// four triangles, boxes from the bottom up, wide nodes from the top down.
 //
-// The binary tree is implicit: its leaves are the places 0 .. count - 1 of the sorted triangles, its
-// inner nodes 0 .. count - 2 each cover the places from the node's own index to ends[node] (either may
-// be the lower one) and part after splits[node].  Node 0 is the root.  A *subtree* is named by its inner
-// node, or LEAF_BIT | place.  Subtrees of at most BLOCK_TRIANGLES triangles become blocks.
+// The binary tree is implicit: its leaves are the places 0 .. count - 1 of the sorted triangles;
+// its inner nodes 0 .. count - 2 each cover the places from the node's own index to ends[node]
+// (either may be the lower one) and part after splits[node].  Node 0 is the root.  A *subtree* is
+// named by its inner node, or LEAF_BIT | place.  Subtrees of at most BLOCK_TRIANGLES triangles
+// become blocks.
 //
 // Karras: Maximizing Parallelism in the Construction of BVHs, Octrees, and k-d Trees, HPG 2012.
 
@@ -97,7 +98,8 @@ kernel void make_codes(
     const uint top = (1u << GRID_BITS) - 1;
     ulong code = 0;
     for (uint axis = 0; axis < 3; ++axis) {
-        const float from_low = 0.5f * centers[3 * (size_t)triangles[i] + axis] - 0.5f * bounds[axis];
+        const float center = centers[3 * (size_t)triangles[i] + axis];
+        const float from_low = 0.5f * center - 0.5f * bounds[axis];
         const float part = half_size > 0.0f ? from_low / half_size : 0.0f;
         const uint cell = min((uint)(part * (float)(1u << GRID_BITS)), top);
         code |= spread_bits(cell) << (2 - axis);
@@ -144,8 +146,8 @@ kernel void find_nodes(
     if (node + 1 >= count)
         return;
     const int i = (int)node;
-    const int step =
-        common_prefix(codes, count, node, i + 1) > common_prefix(codes, count, node, i - 1) ? 1 : -1;
+    const int with_next = common_prefix(codes, count, node, i + 1);
+    const int step = with_next > common_prefix(codes, count, node, i - 1) ? 1 : -1;
 
     // The node covers all places that share more than it shares with its other neighbour.
     const int outside = common_prefix(codes, count, node, i - step);
@@ -281,8 +283,8 @@ static inline Box subtree_box(
 ///
 /// Which one that is does not matter: it reads both children.
 ///
-/// reads   blocks; starts[block]; ends, splits, parents, block_parents; ranks[place], the block that
-///         starts there
+/// reads   blocks; starts[block]; ends, splits, parents, block_parents; ranks[place], the block
+///         that starts there
 /// writes  boxes[6 * node + (0..5)]; visits[node], zero before
 kernel void fit_boxes(
     global const TriangleBlock *blocks,
@@ -458,7 +460,8 @@ kernel void fill_nodes(
         float reach = 0.0f;
         if (k < filled) {
             box = subtree_box(ends, splits, ranks, blocks, boxes, names[k]);
-            child = children[k].size > BLOCK_TRIANGLES ? next++ : LEAF_BIT | ranks[children[k].first];
+            const bool inner = children[k].size > BLOCK_TRIANGLES;
+            child = inner ? next++ : LEAF_BIT | ranks[children[k].first];
             for (uint axis = 0; axis < 3; ++axis)
                 reach = max(reach, max(fabs(box.low[axis]), fabs(box.high[axis])));
         }

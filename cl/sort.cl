@@ -1,4 +1,5 @@
-// Stable radix sort, least significant digit first, 8 bits a pass, over chunks of consecutive items.
+// Stable radix sort, least significant digit first, 8 bits a pass, over chunks of consecutive
+// items.
 //
 // The table has a column a chunk and a row a digit, so that its exclusive scan gives each chunk the
 // places of its items: all of a digit together, and within a digit in the order of the chunks.

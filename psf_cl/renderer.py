@@ -94,7 +94,7 @@ class Renderer:
             self.depth_counts += self.device.read(self.buffers["census"])
             self.device.fill(self.buffers["census"])
             self.censuses += 1
-        counters = self.device.read(self.buffers["counters"])
+        counters = self.device.read(self.buffers["counters"], layout.COUNTER_INDEX["finished"])
         self.device.collect_events()
         return counters
 

@@ -185,3 +185,33 @@ def block_means(image: np.ndarray, blocks: int) -> np.ndarray:
         blocks, height // blocks, blocks, width // blocks, channels
     )
     return parts.mean(axis=(1, 3))
+
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+
+
+def assert_blocks_equal(image: Image, truth: Any, tolerance: float, blocks: int = 4) -> None:
+    """Check every block of ``rgb`` against ``truth``, within a relative ``tolerance``."""
+    np.testing.assert_allclose(
+        block_means(image.rgb, blocks), np.broadcast_to(truth, (blocks, blocks, 3)), rtol=tolerance
+    )
+
+
+def luminance_blocks(image: Image, blocks: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return means of luminance over blocks and their variances, both ``(blocks, blocks)``.
+
+    Of independent samples only.
+    """
+    pixels_per_block = image.width * image.height / blocks**2
+    means = block_means(image.rgb, blocks) @ LUMINANCE
+    variances = block_means(image.aovs["variance"], blocks)[..., 0] / pixels_per_block
+    return means, variances
+
+
+def z_scores(image: Image, truth: Image | float, blocks: int) -> np.ndarray:
+    """Return the deviations of luminance blocks from ``truth`` in standard errors."""
+    means, variances = luminance_blocks(image, blocks)
+    if not isinstance(truth, float):
+        truth, more = luminance_blocks(truth, blocks)
+        variances = variances + more
+    return (means - truth) / np.sqrt(variances)

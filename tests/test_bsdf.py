@@ -129,8 +129,8 @@ def test_values_and_densities_equal_the_papers(lane_device, opaque):
     # Half of the pairs at random, half where the BSDF has its peaks.
     numbers = np.random.default_rng(2).random((count, 3))
     drawn, _, _ = sample(lane_device, records, by_chance, wo, numbers, build)
-    half = count // 2
-    wi[:half] = np.where(np.isfinite(drawn[:half]) & (drawn[:half, 2:] != 0), drawn, wi)[:half]
+    use = (np.arange(count) % 2 == 0) & (drawn[:, 2] != 0)
+    wi[use] = drawn[use]
     values, pdfs = evaluate(lane_device, records, by_chance, wo, wi, transmission=build)
     chance = chances(lane_device, records, wo, build)
 
@@ -163,13 +163,13 @@ def test_chances_are_a_distribution_over_the_lobes_that_exist(lane_device):
     coated = np.array([b.specular > 0 or (b.metallic > 0 and max(b.base_color) > 0) for b in bsdfs])
     clear = np.array([b.transmission > 0 for b in bsdfs])
     opaque = np.array([b.transmission < 1 and max(b.base_color) > 0 for b in bsdfs])
-    # Where all is reflected, at the critical angle, nothing goes on.
+    # Under total reflection nothing reaches the base, but tilted facets still refract a little.
     total = np.array([truth.dielectric(b, o[2]) > 1 - 1e-5 for b, o in zip(bsdfs, wo, strict=True)])
-    exists = np.stack([coated, dielectric & clear & ~total, dielectric & opaque & ~total], axis=1)
-    certain = ~total
-    certain[:10] = False
-    np.testing.assert_array_equal((chance > 0)[certain], exists[certain])
-    assert (chance[exists] > 0.08).all()
+    exists = np.stack([coated, dielectric & clear, dielectric & opaque & ~total], axis=1)
+    exists[:10] = False, False, True
+    np.testing.assert_array_equal(chance > 0, exists)
+    assert (chance[exists & ~total[:, None]] > 0.08).all()
+    assert (chance[exists] > 0.008).all()
 
 
 def lobe_cases():
@@ -214,6 +214,9 @@ def test_samples_of_every_lobe_follow_its_density(lane_device):
             # Quadrature knows the sum to 0.2 %.
             assert found[-1] < 10 + 0.002 * count, label
             expected, found = expected[:-1], found[:-1]
+        if len(expected) < 2:
+            # Beyond the critical angle of a sharp boundary there is nothing.
+            continue
         p = stats.chisquare(found, expected / expected.sum() * found.sum()).pvalue
         assert p > P_MIN, f"{label}: p = {p}"
 
@@ -337,8 +340,8 @@ def test_weights_stay_finite_at_the_extremes(lane_device):
     assert np.isfinite(values).all() and (values >= 0).all()
     assert np.isfinite(pdfs).all() and (pdfs >= 0).all()
     weight = np.where(pdfs > 0, values.max(axis=1) / np.where(pdfs > 0, pdfs, 1), 0)
-    # A lobe has at least a tenth of the samples; leaving glass multiplies by eta^2.
-    assert weight.max() < 12 * 2.4**2, cases[int(weight.argmax()) // len(numbers)]
+    # A lobe has at least a hundredth of the samples; leaving glass multiplies by eta^2.
+    assert weight.max() < 120 * 2.4**2, cases[int(weight.argmax()) // len(numbers)]
 
 
 def test_nothing_crosses_the_real_surface_by_a_shading_normal(lane_device):

@@ -359,7 +359,7 @@ LAMP_COUNT = 2000
 LAMP_COLORS = (
     (1.0, 0.85, 0.65), (0.75, 0.85, 1.0), (1.0, 0.35, 0.2), (0.3, 1.0, 0.45), (0.45, 0.4, 1.0),
 )  # fmt: skip
-LAMP_LEVELS = tuple(3.0 * 2.5**level for level in range(8))
+LAMP_LEVELS = tuple(0.15 * 2.5**level for level in range(8))
 
 
 def make_many_lights() -> Model:

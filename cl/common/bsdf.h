@@ -85,7 +85,9 @@ inline LobeChances lobe_chances(Bsdf b, Float cos_o)
     Float r = pick(reflect > 0.0f, max(reflect * inverse, tenth), (Float)(0.0f));
     Float d = pick(diffuse > 0.0f, max(diffuse * inverse, tenth), (Float)(0.0f));
 #if TRANSMISSION
-    Float t = pick(refract > 0.0f, max(refract * inverse, tenth), (Float)(0.0f));
+    // Where the mean normal reflects all, tilted facets still let light through.
+    const Float least = pick(refract > 0.0f, tenth, tenth * max(b.alpha, tenth));
+    Float t = pick((1.0f - b.metallic) * b.transmission > 0.0f, max(refract * inverse, least), (Float)(0.0f));
     const Float total = r + d + t;
 #else
     const Float total = r + d;

@@ -1,10 +1,11 @@
 // A ray against four triangles and against eight boxes, so that no ray slips through a closed mesh.
 //
-// Watertight means: the sign of an edge function is that of its exact value for the rounded, sheared
-// corners, so two triangles that share an edge agree on which side of it the ray passes.  The rounding
-// of those corners moves them by at most 6 u times their distance from the ray's origin (u = 2^-24,
-// distance by the largest component); BOX_SLACK of that distance is added around every box, half where
-// the tree is built (the corner's part), half where the ray is set up (the origin's part).
+// Watertight means: the sign of an edge function is that of its exact value for the rounded,
+// sheared corners, so two triangles that share an edge agree on which side of it the ray passes.
+// Rounding moves those corners by at most 6 u times their distance from the ray's origin (u = 2^-24,
+// distance by the largest component, so at most the corner's from 0 plus the origin's from 0).
+// Boxes must allow for it: BOX_SLACK times the corner's part is added around them where the tree is
+// built, BOX_SLACK times the origin's part where the ray is set up.
 //
 // Woop, Benthin, Wald: Watertight Ray/Triangle Intersection, JCGT 2 (1), 2013.
 #pragma once
@@ -13,9 +14,9 @@
 
 #define BOX_SLACK 0x1p-21f // 8 u: 6 for the corners, 2 for the rounding of slack and sum
 
-// 1 + 2 gamma(3): the far distance of a box must not be rounded below its near distance.
+// At least 1 + 2 gamma(3): the far distance of a box must not be rounded below its near distance.
 // Ize: Robust BVH Ray Traversal, JCGT 2 (2), 2013.
-#define BOX_FAR_FACTOR 1.0000004f
+#define BOX_FAR_FACTOR 0x1.000008p0f
 
 /// A ray; the direction need not be unit, t counts in its lengths.
 typedef struct {
@@ -37,11 +38,11 @@ typedef struct {
     float near_origin[3]; // the origin, moved back by its slack
     float far_origin[3]; // the origin, moved on
     float inverse[3]; // 1 / direction; infinite for 0
-    uint near_row[3]; // row of BvhNode.bounds that the ray meets first; the other one is near_row ^ 1
+    uint near_row[3]; // row of BvhNode.bounds that the ray meets first; the other is near_row ^ 1
     uint axis[3]; // kx, ky, kz: kz is where the direction is longest
     float origin[3]; // along kx, ky, kz
     float shear[3]; // direction x / z, y / z and 1 / z along those axes
-    float t_max; // 0 if the ray is not finite, has no direction or lies beyond 2^120: it hits nothing
+    float t_max; // 0 if the ray is beyond 2^120, not finite or has no direction: no hits
 } RaySetup;
 
 /// Four triangles' answers; lane k holds only where hit[k] is -1.
@@ -112,10 +113,15 @@ static inline float4 power_of_two_scale(float4 a, float4 b, float4 c, float4 d, 
     return as_float4(0x7F000000 - exponent);
 }
 
+static inline int4 signs_differ(float4 u, float4 v, float4 w)
+{
+    return ((u < 0.0f) | (v < 0.0f) | (w < 0.0f)) & ((u > 0.0f) | (v > 0.0f) | (w > 0.0f));
+}
+
 /// Intersect the four triangles of a block with the line of a ray.
 ///
-/// Both sides count; degenerate and unused triangles are never hit.  Edges belong to both triangles.
-/// Coordinates of any size do: where products leave the range of float, corners are scaled first.
+/// Both sides count; degenerate and unused triangles are never hit.  Edges belong to both
+/// triangles.  Coordinates of any size do: where products leave the range of float, corners are scaled first.
 static inline BlockHit intersect_block(__global const TriangleBlock *block, const RaySetup *ray)
 {
 // A contracted a * b - c * d is not the negative of c * d - a * b.
@@ -136,10 +142,9 @@ static inline BlockHit intersect_block(__global const TriangleBlock *block, cons
     float4 u = cx * by - cy * bx;
     float4 v = ax * cy - ay * cx;
     float4 w = bx * ay - by * ax;
-    int4 outside = ((u < 0.0f) | (v < 0.0f) | (w < 0.0f)) & ((u > 0.0f) | (v > 0.0f) | (w > 0.0f));
     const int4 used = vload4(0, block->id) != (uint4)(NO_HIT);
     BlockHit found;
-    found.hit = used & ~outside;
+    found.hit = used & ~signs_differ(u, v, w);
     if (!any(found.hit))
         return found;
 
@@ -157,8 +162,7 @@ static inline BlockHit intersect_block(__global const TriangleBlock *block, cons
         u = signed_difference(cx, by, cy, bx);
         v = signed_difference(ax, cy, ay, cx);
         w = signed_difference(bx, ay, by, ax);
-        outside = ((u < 0.0f) | (v < 0.0f) | (w < 0.0f)) & ((u > 0.0f) | (v > 0.0f) | (w > 0.0f));
-        found.hit &= ~outside;
+        found.hit &= ~signs_differ(u, v, w);
         determinant = u + v + w;
     }
     const float4 inverse = 1.0f / determinant;
@@ -172,7 +176,7 @@ static inline BlockHit intersect_block(__global const TriangleBlock *block, cons
     return found;
 }
 
-/// Return which of a node's eight children the ray may meet before `limit`, and where it enters them.
+/// Return which of a node's eight children the ray may meet up to `limit`, and where it enters.
 ///
 /// Conservative.  Minima and maxima drop NaN (an infinite inverse times 0: the ray slides along a
 /// face, which does not bound it), and empty children are entered at infinity.
@@ -183,8 +187,10 @@ static inline int8 intersect_boxes(
     float8 far = (float8)(limit);
     for (uint axis = 0; axis < 3; ++axis) {
         const uint row = ray->near_row[axis];
-        const float8 enter = (vload8(0, node->bounds[row]) - ray->near_origin[axis]) * ray->inverse[axis];
-        const float8 leave = (vload8(0, node->bounds[row ^ 1u]) - ray->far_origin[axis]) * ray->inverse[axis];
+        const float8 near_bound = vload8(0, node->bounds[row]);
+        const float8 far_bound = vload8(0, node->bounds[row ^ 1u]);
+        const float8 enter = (near_bound - ray->near_origin[axis]) * ray->inverse[axis];
+        const float8 leave = (far_bound - ray->far_origin[axis]) * ray->inverse[axis];
         near = enter > near ? enter : near;
         far = leave < far ? leave : far;
     }

@@ -21,7 +21,7 @@
 #define IS_THERE(id, u, v) true
 #endif
 
-/// Return the first hit of a ray that is set up; of equally near triangles that of the lowest index.
+/// Return the first hit of a ray that is set up; of equally near ones that of the lowest index.
 static inline Hit trace_closest_setup(
     __global const BvhNode *nodes,
     __global const TriangleBlock *blocks,

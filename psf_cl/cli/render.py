@@ -88,10 +88,13 @@ def run(args: argparse.Namespace) -> int:
     except ImportError as error:
         raise DeviceError(f"no OpenCL ({error}); psf-cl doctor says what to do") from error
 
-    device = open_device(args.device)
+    statistics = args.stats is not None
+    device = open_device(args.device, profiling=statistics)
     if not args.quiet:
         tell_notes(scene)
-    renderer = Renderer(scene, settings, device, outputs=args.aov, crop=args.crop)
+    renderer = Renderer(
+        scene, settings, device, outputs=args.aov, crop=args.crop, statistics=statistics
+    )
     with contextlib.closing(renderer):
         curve = ErrorCurve(reference)
         with stop_on_interrupt() as interrupted, ProgressDisplay(args.quiet) as display:

@@ -60,7 +60,7 @@ def build_bvh(
     """Build the tree over ``triangle_count`` triangles and wait for it.
 
     Triangles with a coordinate that is not finite are left out and counted.  The build takes about
-    80 bytes of scratch a triangle, given back at the end.
+    60 bytes of scratch a triangle, given back at the end.
 
     Args:
         positions: float32, nine items a triangle: the corners p0, p1, p2 in world space, m.

@@ -1,0 +1,288 @@
+"""Furnaces: where all surfaces send out what they get, nothing can be seen but that."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scene_builder import (
+    IDENTITY,
+    assert_blocks_equal,
+    build,
+    camera,
+    dented_bowl,
+    flat,
+    floor,
+    glowing,
+    inside_out,
+    lambertian,
+    luminance_blocks,
+    render,
+)
+
+from psf_cl.scene import primitives, transform
+from psf_cl.scene.model import Environment, Material
+
+Z_LIMIT = 5.0
+MIRRORED = transform.scaling((-1, 1, 1))
+SQUASHED = transform.rotation_xyz_degrees((20, 70, -40)) @ transform.scaling((1.5, -0.7, 1.1))
+
+
+@pytest.mark.parametrize("matrix", [IDENTITY, MIRRORED, SQUASHED], ids=["", "mirrored", "squashed"])
+@pytest.mark.parametrize("direct_sampling", ["mis", "bsdf"])
+def test_closed_lambertian_box_has_radiance_one_everywhere(device, matrix, direct_sampling):
+    walls = inside_out(primitives.box())
+    points = transform.transform_points(matrix, [[0.3, 0.2, 0.6], [-0.5, -0.7, -1]])
+    scene = build([(walls, matrix, glowing(0.5, 0.5))], camera(*points, 80), (16, 16))
+    image = render(
+        device, scene, 256, direct_sampling=direct_sampling, max_depth=1000, roulette_depth=12
+    )
+    assert_blocks_equal(image, 1.0, 0.005)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("view", [(0.9, 0.9, 0.9), (-0.9, 0.1, -0.2), (0.1, -0.95, 0.3)])
+@pytest.mark.parametrize("sampler", ["sobol", "random"])
+def test_closed_lambertian_box_has_radiance_one_with_default_roulette(device, view, sampler):
+    walls = inside_out(primitives.box())
+    scene = build([(walls, IDENTITY, glowing(0.5, 0.5))], camera(view, (0, 0, 0), 90), (16, 16))
+    image = render(device, scene, 8192, sampler=sampler, max_depth=1000)
+    assert_blocks_equal(image, 1.0, 0.005)
+
+
+@pytest.mark.parametrize("light_sampling", ["uniform", "power"])
+def test_closed_sphere_has_radiance_one_by_light_sampling_alone(device, light_sampling):
+    # Inside a sphere every point of it sheds equal light on every other, so this has little noise;
+    # in a box it would be without bound at the edges.
+    wall = inside_out(primitives.sphere(32, 16))
+    scene = build(
+        [(wall, MIRRORED, glowing(0.5, 0.5))], camera((0.3, 0.1, 0.4), (-1, 0, 0), 60), (8, 8)
+    )
+    image = render(
+        device,
+        scene,
+        1024,
+        direct_sampling="light",
+        light_sampling=light_sampling,
+        max_depth=1000,
+        roulette_depth=12,
+    )
+    assert_blocks_equal(image, 1.0, 0.005, blocks=2)
+
+
+@pytest.mark.parametrize("max_depth", [0, 1, 2, 3])
+def test_max_depth_counts_bounces(device, max_depth):
+    wall = inside_out(primitives.sphere(32, 16))
+    scene = build([(wall, IDENTITY, glowing(0.5, 0.5))], camera((0, 0, 0), (-1, 0, 0), 60), (8, 8))
+    truth = 1.0 - 0.5 ** (max_depth + 1)
+    alone = render(device, scene, 4, direct_sampling="bsdf", max_depth=max_depth)
+    np.testing.assert_allclose(alone.rgb, truth, rtol=1e-6)
+    both = render(device, scene, 256, max_depth=max_depth)
+    assert_blocks_equal(both, truth, 0.005, blocks=2)
+
+
+GREY_IMAGE = Environment(
+    (0.5, 0.5, 0.5),
+    np.full((4, 8, 3), 2.0, np.float32),
+    transform.rotation_xyz_degrees((30, 50, 70))[:3, :3],
+)
+
+
+@pytest.mark.parametrize(
+    "environment", [1.0, GREY_IMAGE], ids=["constant sky", "rotated grey image"]
+)
+@pytest.mark.parametrize("direct_sampling", ["mis", "bsdf"])
+def test_white_bowl_looks_like_its_environment(device, environment, direct_sampling):
+    scene = build(
+        [(dented_bowl(), IDENTITY, lambertian(1.0))],
+        camera((0, 2.2, 1.0), (0, 0, 0)),
+        (16, 16),
+        environment=environment,
+    )
+    image = render(
+        device,
+        scene,
+        1024,
+        ["variance"],
+        direct_sampling=direct_sampling,
+        sampler="random",
+        max_depth=100_000,
+        roulette_depth=40,
+    )
+    np.testing.assert_allclose(image.rgb.mean(), 1.0, rtol=0.005)
+    # A block of sky has neither noise nor error.
+    deviation, variance = luminance_blocks(image, 4)
+    assert (np.abs(deviation - 1.0) <= Z_LIMIT * np.sqrt(variance) + 1e-5).all()
+    assert np.sqrt(variance).max() < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "environment", [1.0, GREY_IMAGE], ids=["constant sky", "rotated grey image"]
+)
+def test_every_part_of_the_white_bowl_looks_like_its_environment(device, environment):
+    scene = build(
+        [(dented_bowl(64, 32), IDENTITY, lambertian(1.0))],
+        camera((0, 2.2, 1.0), (0, 0, 0)),
+        (16, 16),
+        environment=environment,
+    )
+    image = render(device, scene, 16384, max_depth=100_000)
+    assert_blocks_equal(image, 1.0, 0.005)
+
+
+# One vertex of a rough surface under a grey sky: the directional albedo, against quadrature over the
+# microfacets that are hit, which knows nothing of how the renderer draws them.
+
+
+def fresnel(cosine, eta):
+    """Return the reflectance of a boundary into a medium of relative index ``eta``."""
+    sine2 = (1 - cosine**2) / eta**2
+    beyond = np.sqrt(np.maximum(1 - sine2, 0))
+    s = (cosine - eta * beyond) / (cosine + eta * beyond)
+    p = (eta * cosine - beyond) / (eta * cosine + beyond)
+    return np.where(sine2 >= 1, 1.0, (s**2 + p**2) / 2)
+
+
+def schlick(f0, cosine):
+    return f0 + (1 - f0) * (1 - cosine) ** 5
+
+
+def microfacets(alpha, angle):
+    """Return wo, microfacet normals of equal weight by D cos, and the weight G / (cos_o cos_h) o.h.
+
+    Walter et al., "Microfacet Models for Refraction", 2007: the normals by its equation 35, on a
+    grid of midpoints.  The weight is without the part of G that depends on wi.
+    """
+    count = 1000
+    u, v = np.meshgrid((np.arange(count) + 0.5) / count, (np.arange(count) + 0.5) / count)
+    tangent = alpha * np.sqrt(u / (1 - u))
+    cosine = 1 / np.sqrt(1 + tangent**2)
+    h = np.stack(
+        [
+            tangent * cosine * np.cos(2 * np.pi * v),
+            tangent * cosine * np.sin(2 * np.pi * v),
+            cosine,
+        ],
+        axis=-1,
+    )
+    wo = np.array([np.sin(angle), 0.0, np.cos(angle)])
+    oh = h @ wo
+    return wo, h, np.maximum(oh, 0.0) / (wo[2] * cosine)
+
+
+def masking_lambda(cosine, alpha):
+    """Return Smith's Lambda of GGX; Heitz, "Understanding the Masking-Shadowing Function", 2014."""
+    tangent2 = (1 - cosine**2) / np.maximum(cosine**2, 1e-12)
+    return (np.sqrt(1 + alpha**2 * tangent2) - 1) / 2
+
+
+def masked(wo, cos_i, alpha):
+    """Return height-correlated G; 0 where wi is on the wrong side."""
+    g = 1 / (1 + masking_lambda(wo[2], alpha) + masking_lambda(cos_i, alpha))
+    return np.where(cos_i > 0, g, 0.0)
+
+
+def reflected(alpha, angle, reflectance):
+    """Return what a mirror of microfacets reflects of a white sky, with ``reflectance(cosine)``."""
+    wo, h, weight = microfacets(alpha, angle)
+    oh = h @ wo
+    cos_i = 2 * oh * h[..., 2] - wo[2]
+    return (weight * masked(wo, cos_i, alpha) * reflectance(np.maximum(oh, 0.0))).mean()
+
+
+def refracted(alpha, angle, eta):
+    """Return the radiance that comes through a boundary into a medium of index ``eta``.
+
+    The sky beyond has radiance 1, which the boundary changes by 1 / eta^2.
+    """
+    wo, h, weight = microfacets(alpha, angle)
+    oh = np.maximum(h @ wo, 0.0)
+    sine2 = (1 - oh**2) / eta**2
+    beyond = np.sqrt(np.maximum(1 - sine2, 0))
+    below = -(-wo[2] / eta + (oh / eta - beyond) * h[..., 2])
+    through = np.where(sine2 < 1, 1 - fresnel(oh, eta), 0.0)
+    return (weight * masked(wo, below, alpha) * through).mean() / eta**2
+
+
+def diffuse_under_coat(angle):
+    """Return the light of a white Lambertian base under a smooth coat of index 1.5."""
+    count = 1000
+    cosine = np.sqrt((np.arange(count) + 0.5) / count)[:, None]
+    azimuth = 2 * np.pi * (np.arange(count) + 0.5) / count
+    sine = np.sqrt(1 - cosine**2)
+    wi = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine + 0 * azimuth], axis=-1)
+    half = wi + [np.sin(angle), 0.0, np.cos(angle)]
+    cos_h = (half * wi).sum(axis=-1) / np.linalg.norm(half, axis=-1)
+    return (1 - schlick(0.04, cos_h)).mean()
+
+
+def seen_under_white_sky(device, material, degrees, side=1.0, spp=1024):
+    """Return the radiance of a plane of ``material``, seen at ``degrees`` from its normal."""
+    angle = np.radians(degrees)
+    view = camera((50 * np.sin(angle), 50 * side * np.cos(angle), 0), (0, 0, 0), 0.5)
+    scene = build([floor(20.0, material)], view, (8, 8), environment=1.0)
+    return render(device, scene, spp, max_depth=1).rgb.mean(axis=(0, 1), dtype=np.float64)
+
+
+ANGLES = [0, 45, 75]
+
+
+@pytest.mark.parametrize("roughness", [0.1, 0.3, 0.6, 1.0])
+@pytest.mark.parametrize("degrees", ANGLES)
+def test_white_metal_reflects_what_quadrature_says_and_never_more_than_it_gets(
+    device, roughness, degrees
+):
+    metal = Material(base_color=(1.0, 1.0, 1.0), metallic=1.0, roughness=roughness)
+    seen = seen_under_white_sky(device, metal, degrees)
+    truth = reflected(roughness**2, np.radians(degrees), np.ones_like)
+    np.testing.assert_allclose(seen, truth, rtol=0.004)
+    assert seen.max() < 1.001
+
+
+@pytest.mark.parametrize("roughness", [0.2, 0.6, 1.0])
+@pytest.mark.parametrize("degrees", ANGLES)
+def test_white_plastic_reflects_what_quadrature_says_and_never_more_than_it_gets(
+    device, roughness, degrees
+):
+    seen = seen_under_white_sky(
+        device, Material(base_color=(1.0, 1.0, 1.0), roughness=roughness), degrees
+    )
+    angle = np.radians(degrees)
+    coat = reflected(roughness**2, angle, lambda cosine: schlick(0.04, cosine))
+    np.testing.assert_allclose(seen, coat + diffuse_under_coat(angle), rtol=0.004)
+    assert seen.max() < 1.001
+
+
+@pytest.mark.parametrize("roughness", [0.1, 0.5, 0.9])
+@pytest.mark.parametrize("degrees", ANGLES)
+@pytest.mark.parametrize("side", [1.0, -1.0], ids=["from outside", "from inside"])
+def test_glass_boundary_reflects_and_refracts_what_quadrature_says(
+    device, roughness, degrees, side
+):
+    glass = Material(base_color=(1.0, 1.0, 1.0), roughness=roughness, transmission=1.0, ior=1.5)
+    seen = seen_under_white_sky(device, glass, degrees, side)
+    eta = 1.5 if side > 0 else 1 / 1.5
+    alpha, angle = roughness**2, np.radians(degrees)
+    truth = reflected(alpha, angle, lambda cosine: fresnel(cosine, eta))
+    truth += refracted(alpha, angle, eta)
+    np.testing.assert_allclose(seen, truth, rtol=0.006)
+
+
+@pytest.mark.parametrize("shape", ["smooth sphere", "faceted sphere", "box"])
+@pytest.mark.parametrize("roughness", [0.0, 0.4])
+def test_glass_gives_back_what_it_gets(device, shape, roughness):
+    mesh = {
+        "smooth sphere": primitives.sphere(),
+        "faceted sphere": flat(primitives.sphere(32, 16)),
+        "box": primitives.box(),
+    }[shape]
+    glass = Material(base_color=(1.0, 1.0, 1.0), roughness=roughness, transmission=1.0)
+    turned = transform.rotation_xyz_degrees((20, 30, 0))
+    view = camera((0, 0, 12), (0, 0, 0), 5)
+    scene = build([(mesh, turned, glass)], view, (8, 8), environment=1.0)
+    seen = render(device, scene, 512, max_depth=10_000).rgb.mean()
+    # Rough boundaries lose what would be scattered twice by one of them.
+    if roughness == 0.0:
+        np.testing.assert_allclose(seen, 1.0, rtol=0.005)
+    else:
+        assert 0.93 < seen < 1.001
