@@ -82,7 +82,7 @@ kernel void add_samples(
 /// reads, writes  counters
 kernel void advance_film(__global const Params *params, volatile __global uint *counters)
 {
-    if (get_global_id(0) != 0)
+    if (get_global_id(0) != 0 || params->pixel_count == 0)
         return;
     uint done = 0;
     while (pass_is_complete(params, counters, done)) // at most params->ring

@@ -226,16 +226,14 @@ def tone_map(rgb: np.ndarray, exposure_ev: float = 0.0) -> np.ndarray:
     """
     knee, desaturation = 0.8, 0.15
     finite = np.isfinite(rgb).all(axis=-1, keepdims=True)
-    # As float32, for speed; so bright a colour is white whatever its exact value.
-    scaled = np.where(finite, np.clip(rgb, 0.0, 1e30 * 2.0 ** -max(exposure_ev, 0.0)), 0.0)
-    scaled = scaled.astype(np.float32) * np.float32(2.0**exposure_ev)
+    scaled = np.where(finite, np.maximum(rgb, 0.0), 0.0) * np.float64(2.0) ** exposure_ev
     peak = np.maximum(scaled.max(axis=-1, keepdims=True), knee)
     new_peak = 1.0 - (1.0 - knee) ** 2 / (peak + 1.0 - 2.0 * knee)
     whiteness = 1.0 - 1.0 / (desaturation * (peak - new_peak) + 1.0)
     linear = scaled * (new_peak / peak)
     linear += (new_peak - linear) * whiteness
     low = linear * 12.92
-    high = 1.055 * np.maximum(linear, 1e-9) ** np.float32(1.0 / 2.4) - 0.055
+    high = 1.055 * np.maximum(linear, 1e-9) ** (1.0 / 2.4) - 0.055
     encoded = np.where(linear <= 0.0031308, low, high)
     return np.where(finite, np.rint(encoded * 255.0), (255, 0, 255)).astype(np.uint8)
 

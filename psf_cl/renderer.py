@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,9 @@ import numpy as np
 
 from psf_cl import tables
 from psf_cl.device import layout
-from psf_cl.device.bvh import Bvh, build_bvh
+from psf_cl.device.bvh import MIN_STACK_SIZE, Bvh, build_bvh
 from psf_cl.device.device import Buffer, Device, open_device
-from psf_cl.device.program import Launch, load_program
+from psf_cl.device.program import Launch, Program, load_program
 from psf_cl.errors import InputError
 from psf_cl.image import Image
 from psf_cl.plan import Plan, make_plan
@@ -62,16 +63,20 @@ class Renderer:
         self.censuses = 0
         self.depth_counts = np.zeros(OCCUPANCY_BINS)
         self.buffers: dict[str, Buffer] = {}
-        self._allocate()
-        geometry = self._upload_scene()
-        load_end = time.perf_counter()
-        self.bvh: Bvh = self._build_bvh(geometry)
-        build_end = time.perf_counter()
-        self._bind()
+        with ThreadPoolExecutor(1) as background:
+            compiling = background.submit(self._compile, MIN_STACK_SIZE)
+            self._allocate()
+            geometry = self._upload_scene()
+            load_end = time.perf_counter()
+            self.bvh: Bvh = self._build_bvh(geometry)
+            build_end = time.perf_counter()
+            programs = compiling.result()
+        if self.bvh.stack_size != MIN_STACK_SIZE:
+            programs = self._compile(self.bvh.stack_size)
+        self._bind(programs)
         self.scheduler = Scheduler(
             Frame(self._bounce, self._film, self._counters, self._limit), self.plan.pixel_count
         )
-        self._warm_up()
         self.load_seconds = load_end - start
         self.build_seconds = build_end - load_end
         self.compile_seconds = time.perf_counter() - build_end
@@ -348,19 +353,25 @@ class Renderer:
         self.buffers |= {"nodes": bvh.nodes, "blocks": bvh.blocks}
         return bvh
 
-    def _bind(self) -> None:
-        self.bounce_launches: list[Launch] = []
+    def _compile(self, stack_size: int) -> dict[str, Program]:
+        """Build the stages' programs, down to machine code; runs beside the loading of the scene."""
+        programs = {}
         for stage in self.plan.stages:
-            if stage.name == "film":
-                self.film_program = load_program(
-                    self.device, stage.source, self.plan.defines(stage)
-                )
-                continue
-            defines = self.plan.defines(stage) | {"STACK_SIZE": self.bvh.stack_size}
-            program = load_program(self.device, stage.source, defines)
-            self.bounce_launches += [
-                program.bind_planned(name, self.buffers) for name in stage.kernels
-            ]
+            defines = self.plan.defines(stage)
+            if stage.traces:
+                defines |= {"STACK_SIZE": stack_size}
+            programs[stage.name] = load_program(self.device, stage.source, defines)
+            programs[stage.name].warm_up(*stage.kernels)
+        return programs
+
+    def _bind(self, programs: dict[str, Program]) -> None:
+        self.bounce_launches: list[Launch] = [
+            programs[stage.name].bind_planned(kernel, self.buffers)
+            for stage in self.plan.stages
+            if stage.name != "film"
+            for kernel in stage.kernels
+        ]
+        self.film_program = programs["film"]
         self.film_launches = [
             (self._add_launch(ring, name, planes, partial=False), planes)
             for ring, name, planes in film.PLANES
@@ -388,17 +399,6 @@ class Renderer:
             planes=planes,
             partial=int(partial),
         )
-
-    def _warm_up(self) -> None:
-        """Launch everything once while no pass may start: PoCL generates code only then."""
-        self._limit(0)
-        self._bounce()
-        self._film()
-        if self.statistics:
-            self.census(self.plan.traits.slots, film.GROUP)
-        self.device.wait()
-        self.device.collect_events()
-        self.device.totals.clear()
 
     def _occupancy(self) -> list[float] | None:
         """Return the mean share of the slots whose path lives, by its bounces so far."""

@@ -109,7 +109,7 @@ def flat(mesh: Mesh) -> Mesh:
 
 
 def dented_bowl(columns: int = 24, rows: int = 12) -> Mesh:
-    """Return an open, non-convex cup around the origin, its opening towards +Y, its size about 1."""
+    """Return an open, non-convex cup around the origin, about 1 in size, its opening towards +Y."""
     u, v = np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1))
     azimuth = 2 * np.pi * u
     polar = np.radians(50) + v * np.radians(130)

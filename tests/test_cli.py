@@ -8,15 +8,18 @@ import signal
 import subprocess
 import sys
 import types
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
+import PIL.Image
 import pytest
 
 from psf_cl.cli.main import main
 from psf_cl.cli.progress import describe, seconds_left
 from psf_cl.errors import DeviceError
-from psf_cl.image import Image, read_exr, write_exr
+from psf_cl.image import AOVS, Image, read_exr, write_exr
+from psf_cl.measure.errors import LUMINANCE
 from psf_cl.scene.model import Scene
 from psf_cl.settings import Settings
 
@@ -37,8 +40,11 @@ class FakeRenderer:
     on_pass = staticmethod(lambda passes: None)
     build_error: BaseException | None = None
     value = 1.0
+    started = 1.0
 
-    def __init__(self, scene, settings, device=None, outputs=frozenset(), crop=None):
+    def __init__(
+        self, scene, settings, device=None, outputs=frozenset(), crop=None, statistics=False
+    ):
         type(self).made = {"settings": settings, "outputs": outputs, "crop": crop, "device": device}
         if self.build_error is not None:
             raise self.build_error
@@ -64,15 +70,18 @@ class FakeRenderer:
         yield
 
     def snapshot(self, names=("rgb",)):
-        rgb = np.full((self.height, self.width, 3), self.value + 1.0 / self.passes, np.float32)
+        value = self.value + 1.0 / max(self.passes, 1)
+        aovs = {"rgb": np.full((self.height, self.width, 3), value, np.float32)}
+        aovs["samples"] = np.full((self.height, self.width, 1), self.started, np.float32)
         place = (self.x, self.y, self.scene.width, self.scene.height)
-        return Image({"rgb": rgb}, {}, *place)
+        return Image({name: aovs[name] for name in names}, self.stats(), *place)
 
     def image(self):
         return self.snapshot()
 
     def stats(self):
         return {
+            "scene": self.scene.path,
             "spp": self.passes,
             "render_seconds": self.passes * 0.25,
             "seed": 0,
@@ -100,10 +109,12 @@ def fake(monkeypatch, tmp_path):
         monkeypatch.setitem(sys.modules, name, made)
 
     module("psf_cl.renderer", Renderer=Renderer)
-    module("psf_cl.device.device", open_device=lambda name: f"device {name}")
+    module("psf_cl.device.device", open_device=lambda name, profiling: f"device {name}")
     module("psf_cl.scene.load", load_scene=load_scene)
     monkeypatch.chdir(tmp_path)
     return Renderer
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def files_in(folder):
@@ -293,60 +304,231 @@ def test_the_second_ctrl_c_stops_at_once_and_writes_nothing(fake, tmp_path, caps
     assert files_in(tmp_path) == [] and fake.made["renderer"].closed
 
 
-def test_interrupted_before_the_first_pass_writes_nothing(fake, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("started", "files"), [(0.0, []), (0.5, ["a.exr", "a.png"])], ids=["nothing", "some pixels"]
+)
+def test_of_an_incomplete_first_pass_what_is_there_is_written(
+    fake, tmp_path, capsys, started, files
+):
     def render(self, spp=None, seconds=None, progress=None):
         signal.raise_signal(signal.SIGINT)
         assert not progress(Progress(0, spp, 0.0, seconds, 0.0))
 
-    fake.render = render
-    assert main(["render", "a.toml", "--quiet"]) == 130
-    assert files_in(tmp_path) == []
+    fake.render, fake.started = render, started
+    assert main(["render", "a.toml"]) == 130
+    assert files_in(tmp_path) == files
+    captured = capsys.readouterr()
+    assert captured.out.startswith("a.exr: part of the first pass" if files else "")
+    assert "interrupted" in captured.err
 
 
-def test_plan_prints_reasons_and_sums_and_json(fake, monkeypatch, capsys):
-    buffer = types.SimpleNamespace(name="paths", bytes=3 << 20, what="path state [x]")
-    stages = [
-        types.SimpleNamespace(
-            name="shade",
-            planned=True,
-            reason="always",
-            kernels=("shade_surface",),
-            buffers=(buffer,),
-        ),
-        types.SimpleNamespace(
-            name="masks", planned=False, reason="no alpha", kernels=(), buffers=(buffer,)
-        ),
-    ]
-    plan = types.SimpleNamespace(
-        stages=stages,
-        features={"ALPHA": False, "LANES": 16},
-        left_out=[("textures", "the scene has none")],
-        total_bytes=3 << 20,
-        as_dict=lambda: {"total_bytes": 3 << 20},
+@pytest.fixture
+def all_features(tmp_path, monkeypatch):
+    """Work in a folder with ``all.toml``, a scene that needs every feature there is."""
+    monkeypatch.chdir(tmp_path)
+    sky = np.random.default_rng(1).random((4, 8, 3), np.float32)
+    write_exr("sky.exr", Image({"rgb": sky}))
+    checks = np.indices((8, 8)).sum(0)[..., None] % 2 * np.full(4, 255)
+    PIL.Image.fromarray(checks.astype(np.uint8)).save("checks.png")
+    (tmp_path / "all.toml").write_text(ALL_FEATURES)
+    return tmp_path
+
+
+ALL_FEATURES = """
+film = { width = 24, height = 16 }
+environment = { image = "sky.exr" }
+
+[[cameras]]
+name = "front"
+position = [0, 1, 4]
+target = [0, 0, 0]
+lens_radius = 0.05
+
+[[cameras]]
+name = "above"
+position = [0, 9, 0]
+target = [0, 0, 0]
+up = [0, 0, 1]
+
+[materials]
+net = { base_color_texture = "checks.png", alpha_mode = "mask" }
+glass = { transmission = 1.0, roughness = 0.2 }
+
+[[shapes]]
+primitive = "quad"
+material = "net"
+
+[[shapes]]
+primitive = "sphere"
+material = "glass"
+
+[[shapes]]
+primitive = "disk"
+emission = [1, 1, 1]
+transform = [{ translate = [0, 2, 0] }]
+
+[[lights]]
+type = "point"
+position = [1, 1, 1]
+"""
+
+
+def test_plan_prints_what_it_plans_with_reasons_and_bytes(all_features, capsys):
+    assert main("plan all.toml --json --aov depth".split()) == 0
+    plan = json.loads(capsys.readouterr().out)
+    assert plan["total_bytes"] == sum(
+        buffer["bytes"]
+        for owner in [{"buffers": plan["scene_buffers"]}, *plan["stages"]]
+        for buffer in owner["buffers"]
     )
-    seen = {}
+    assert main("plan all.toml --aov depth".split()) == 0
+    words = " ".join(capsys.readouterr().out.split())
+    for stage in plan["stages"]:
+        assert stage["reason"] in words
+        for text in stage["kernels"]:
+            assert text in words
+    for buffer in plan["scene_buffers"] + [b for s in plan["stages"] for b in s["buffers"]]:
+        assert buffer["what"] in words and f"{buffer['bytes']:,}" in words
+    for name, feature in plan["features"].items():
+        assert (name if feature["value"] else name.lower()) in words
+        assert feature["reason"] in words
+    assert f"{plan['total_bytes']:,}" in words
 
-    def make_plan(scene, settings, outputs, device, crop):
-        seen.update(outputs=outputs, device=device, crop=crop, settings=settings)
-        return plan
 
-    module = types.ModuleType("psf_cl.plan")
-    module.make_plan = make_plan
-    monkeypatch.setitem(sys.modules, "psf_cl.plan", module)
-    assert main("plan a.toml --aov depth --crop 1,1,2,2 --set max_depth=9".split()) == 0
-    assert seen == {
-        "outputs": {"depth"},
-        "device": None,
-        "crop": (1, 1, 2, 2),
-        "settings": Settings(max_depth=9),
-    }
-    out = capsys.readouterr().out
-    for text in ("shade_surface", "always", "no alpha", "LANES", "16", "textures", "has none"):
-        assert text in out
-    assert "path state [x]" in out and "3.0 MiB" in out
-    assert out.count("3,145,728") == 2  # The buffer and the sum, but not what is left out.
-    assert main("plan a.toml --json".split()) == 0
-    assert json.loads(capsys.readouterr().out) == {"total_bytes": 3 << 20}
+def test_plan_follows_the_options(all_features, capsys):
+    def features(arguments):
+        assert main(["plan", "all.toml", "--json", *arguments.split()]) == 0
+        planned = json.loads(capsys.readouterr().out)
+        return planned, {name for name, f in planned["features"].items() if not f["value"]}
+
+    plan, off = features("")
+    assert off == {"AOV_DIRECT", "AOV_FEATURES"} and plan["crop"] == [0, 0, 24, 16]
+    plan, off = features("--camera above --aov direct --crop 1,2,3,4")
+    assert off == {"LENS", "AOV_FEATURES"} and plan["crop"] == [1, 2, 3, 4]
+
+
+def test_plan_needs_no_opencl(all_features):
+    script = (
+        "import sys\nsys.modules['pyopencl'] = None\n"
+        "from psf_cl.cli.main import main\nsys.exit(main(['plan', *sys.argv[1:]]))"
+    )
+    command = [sys.executable, "-c", script, str(all_features / "all.toml")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    assert (done.returncode, done.stderr) == (0, "") and "shade_paths" in done.stdout
+
+
+def rendered(arguments):
+    """Render with the device of this machine; return the image that was written."""
+    assert main(["render", *arguments.split(), "-o", "out.exr"]) == 0
+    return read_exr("out.exr")
+
+
+def test_a_real_render_delivers_all_that_was_asked_for(device, all_features, capfd):
+    white = np.ones((16, 24, 3), np.float32)
+    write_exr("white.exr", Image({"rgb": white}))
+    arguments = f"all.toml --spp 3 --seed 7 --aov {','.join(AOVS)} --stats s.json"
+    image = rendered(f"{arguments} --reference white.exr")
+    captured = capfd.readouterr()
+    assert captured.out.startswith("out.exr: 3 spp") and captured.out.count("\n") == 1
+    assert captured.err == ""
+    with PIL.Image.open("out.png") as png:
+        assert png.size == (24, 16)
+
+    assert set(image.aovs) == {"rgb", *AOVS}
+    assert (image.aovs["samples"] == 3.0).all()
+    total = image.aovs["direct"] + image.aovs["indirect"]
+    np.testing.assert_allclose(total, image.rgb, rtol=1e-5, atol=1e-6)
+
+    stats = json.loads((all_features / "s.json").read_text())
+    assert (stats["spp"], stats["passes"], stats["seed"]) == (3, 3, 7)
+    assert stats["device"] == device.name and stats["scene"] == "all.toml"
+    assert stats["settings"] == dataclasses.asdict(Settings(seed=7))
+    assert stats["rays"]["camera"] == 3 * 24 * 16
+    assert stats["peak_device_bytes"] > 0 and stats["counters"]["rejected_samples"] == 0
+    assert sum(stats["occupancy"]) > 0
+    ran = {stage["name"]: stage["launches"] for stage in stats["stages"]}
+    assert min(ran[kernel] for kernel in ("shade_paths", "intersect_closest", "add_samples")) > 0
+    parts = sum(stats[f"{name}_seconds"] for name in ("render", "build", "compile", "load"))
+    assert 0.0 < parts < stats["process_seconds"]
+    last = stats["error"][-1]
+    luminance = image.rgb.astype(np.float64) @ LUMINANCE
+    assert last["spp"] == 3
+    assert last["relmse"] == pytest.approx(np.mean((luminance - 1.0) ** 2) / 1.01, rel=0.5)
+
+
+def test_a_crop_has_the_bits_of_the_whole_picture(device, all_features):
+    whole = rendered("all.toml --spp 2 --quiet")
+    crop = rendered("all.toml --spp 2 --quiet --crop 5,3,9,8")
+    assert whole.covers(crop)
+    np.testing.assert_array_equal(crop.rgb, whole.cropped(5, 3, 9, 8).rgb)
+
+
+def test_seconds_give_the_bits_of_as_many_samples(device, all_features):
+    timed = rendered("all.toml --seconds 0.2 --quiet")
+    counted = rendered(f"all.toml --spp {timed.stats['spp']} --quiet")
+    np.testing.assert_array_equal(timed.rgb, counted.rgb)
+
+
+def test_half_floats_cameras_environments_and_sizes_reach_the_picture(device, all_features):
+    write_exr("red.exr", Image({"rgb": np.full((2, 4, 3), (3.0, 0.0, 0.0), np.float32)}))
+    front = rendered("all.toml --spp 1 --quiet --half")
+    np.testing.assert_array_equal(front.rgb, front.rgb.astype(np.float16))
+    above = rendered("all.toml --spp 1 --quiet --size 10x20 --camera above --environment red.exr")
+    assert above.rgb.shape == (20, 10, 3)
+    # The corners of the narrow picture are past the quad.
+    np.testing.assert_array_equal(above.rgb[0, 0], (3.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        "light_sampling=uniform direct_sampling=light termination=off sampler=random max_depth=3",
+        "light_sampling=power direct_sampling=bsdf termination=roulette roulette_depth=0",
+        "sampler=sobol direct_sampling=mis integrator=path max_depth=0 seed=4294967295",
+    ],
+)
+def test_every_value_of_every_setting_renders(device, all_features, settings):
+    image = rendered(f"all.toml --spp 1 --quiet --preset pt --set {settings}")
+    assert np.isfinite(image.rgb).all() and image.rgb.any()
+    for name, value in (setting.split("=") for setting in settings.split()):
+        assert str(image.stats["settings"][name]) == value
+
+
+def test_vertices_that_are_not_finite_are_dropped_counted_and_harmless(device, all_features):
+    quad = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nf 1 2 3 4\n"
+    (all_features / "whole.obj").write_text(quad)
+    (all_features / "broken.obj").write_text(quad + "v nan 0 0\nf 1 2 5\nf 2 3 5\n")
+    whole = rendered("whole.obj --size 8x8 --spp 2 --quiet")
+    broken = rendered("broken.obj --size 8x8 --spp 2 --quiet --stats s.json")
+    np.testing.assert_array_equal(broken.rgb, whole.rgb)
+    stats = json.loads((all_features / "s.json").read_text())
+    assert stats["counters"]["dropped_triangles"] == 2
+
+
+def test_the_device_is_chosen_by_option_before_variable(device, all_features, monkeypatch, capfd):
+    monkeypatch.setenv("PSF_CL_DEVICE", "of_nobody")
+    assert main("render all.toml --spp 1 -o out.exr".split()) == 2
+    assert "PSF_CL_DEVICE: no device matches 'of_nobody'" in one_error(capfd.readouterr())
+    some = device.name.split(": ")[1][:6]
+    assert main(["render", "all.toml", "--spp", "1", "-o", "out.exr", "--device", some]) == 0
+
+
+def test_ctrl_c_in_a_real_render_writes_what_is_there(device, all_features):
+    command = [sys.executable, "-m", "psf_cl", "render", str(all_features / "all.toml")]
+    command += ["--spp", "100000000", "-o", str(all_features / "out.exr")]
+    with subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        line = process.stderr.readline()
+        assert line.startswith("rendering: "), line
+        process.send_signal(signal.SIGINT)
+        out, error = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert error == "psf-cl: interrupted; what was rendered is written\n"
+    image = read_exr(all_features / "out.exr")
+    assert image.stats["spp"] > 0 and np.isfinite(image.rgb).all() and image.rgb.any()
+    assert out.endswith("Msamples/s\n")
+    assert files_in(all_features) == ["all.toml", "checks.png", "out.exr", "out.png", "sky.exr"]
 
 
 @dataclasses.dataclass
@@ -415,8 +597,6 @@ def test_compare_fails_on_pixels_that_are_not_finite(tmp_path, monkeypatch, caps
 
 
 def test_compare_shows_the_sign_of_the_difference(tmp_path, monkeypatch):
-    import PIL.Image
-
     monkeypatch.chdir(tmp_path)
     rgb = np.ones((1, 4, 3), np.float32)
     write_exr("b.exr", Image({"rgb": rgb}))

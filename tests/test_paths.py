@@ -1,8 +1,8 @@
 """The estimators against truth: closed forms, quadrature in NumPy, and each other.
 
 Where noise is left, a test takes ``sampler = random``, whose samples are independent, so that the
-variance AOV gives honest error bars, and asks for less than Z_LIMIT standard errors: about one false
-alarm in 10^6 comparisons.
+variance AOV gives honest error bars, and asks for less than Z_LIMIT standard errors: about one
+false alarm in 10^6 comparisons.
 """
 
 from __future__ import annotations
@@ -133,6 +133,7 @@ def test_shadow_of_an_occluder_is_black_and_sharp(device):
         return np.where(shadowed(points), 0.0, 5.0 * point_irradiance(points, light.position)[0])
 
     truth = floor_radiance(irradiance)
+    # A grid of 64 x 64 does not see a sliver that one of 1024 samples can fall into; a wider rim does.
     share = shadowed(floor_points(VIEW, SIZE, sub=16)).mean(axis=-1)
     assert (share == 1.0).any()
     image = render(device, scene, 1024, max_depth=1)
@@ -371,7 +372,7 @@ def test_environment_image_lights_a_floor_as_its_integral_says(device, direct_sa
 
 
 def varied_scene():
-    """Return area lights of several sizes, a sky image, a point light, and glossy and matt things."""
+    """Return area lights, a sky image and a point light over glossy and matt things."""
     quad, ball, lift = primitives.quad(), primitives.sphere(24, 12), transform.translation
     plastic = Material(base_color=(0.6, 0.3, 0.2), roughness=0.5)
     metal = Material(base_color=(0.9, 0.8, 0.5), metallic=1.0, roughness=0.4)

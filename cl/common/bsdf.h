@@ -86,7 +86,7 @@ inline LobeChances lobe_chances(Bsdf b, Float cos_o)
     Float d = pick(diffuse > 0.0f, max(diffuse * inverse, tenth), (Float)(0.0f));
 #if TRANSMISSION
     // Where the mean normal reflects all, tilted facets still let light through.
-    const Float least = pick(refract > 0.0f, tenth, tenth * max(b.alpha, tenth));
+    const Float least = pick(refract > 0.0f, tenth, clamp(b.alpha, 0.1f * tenth, tenth));
     Float t = pick((1.0f - b.metallic) * b.transmission > 0.0f, max(refract * inverse, least), (Float)(0.0f));
     const Float total = r + d + t;
 #else
@@ -229,7 +229,8 @@ inline Vec3 sample_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Float u_lobe, Floa
     const Mask passes = refract & (cos2 > 0.0f);
     const Vec3 bent = add_scaled(scale(wo, -1.0f / b.eta), h, oh / b.eta - sqrt(max(cos2, 0.0f)));
     wi = pick_v(passes, bent, wi);
-    wi.z = pick(refract & !passes, (Float)(0.0f), wi.z);
+    // A draw that crosses its lobe's horizon has failed: it is not one of the other lobe's.
+    wi.z = pick(refract, pick(passes, min(wi.z, 0.0f), (Float)(0.0f)), max(wi.z, 0.0f));
 #endif
     return wi;
 }

@@ -2,8 +2,8 @@
 //
 // Watertight means: the sign of an edge function is that of its exact value for the rounded,
 // sheared corners, so two triangles that share an edge agree on which side of it the ray passes.
-// Rounding moves those corners by at most 6 u times their distance from the ray's origin (u = 2^-24,
-// distance by the largest component, so at most the corner's from 0 plus the origin's from 0).
+// Rounding moves those corners by at most 6 u times their distance from the ray's origin, with
+// u = 2^-24 and the distance by the largest component: at most the corner's plus the origin's from 0.
 // Boxes must allow for it: BOX_SLACK times the corner's part is added around them where the tree is
 // built, BOX_SLACK times the origin's part where the ray is set up.
 //
@@ -121,7 +121,8 @@ static inline int4 signs_differ(float4 u, float4 v, float4 w)
 /// Intersect the four triangles of a block with the line of a ray.
 ///
 /// Both sides count; degenerate and unused triangles are never hit.  Edges belong to both
-/// triangles.  Coordinates of any size do: where products leave the range of float, corners are scaled first.
+/// triangles.  Coordinates of any size do: where products leave the range of float, corners are
+/// scaled first.
 static inline BlockHit intersect_block(__global const TriangleBlock *block, const RaySetup *ray)
 {
 // A contracted a * b - c * d is not the negative of c * d - a * b.

@@ -119,7 +119,7 @@ typedef struct {
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.
 typedef struct {
-    float bounds[6][8]; // x low, x high, y low, y high, z low, z high of each child; an empty one is inverted
+    float bounds[6][8]; // x low, x high, y low ... of each child; an empty one is inverted
     uint child[8]; // node index, or LEAF_BIT | block index
     uint unused[8]; // fills the cache line
 } BvhNode;

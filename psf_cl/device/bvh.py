@@ -19,7 +19,7 @@ MOST_TRIANGLES = 1 << 29
 _CODE_BITS = 63
 _GROUP = 64
 _STACK_STEP = 32
-_SMALLEST_STACK = 64
+MIN_STACK_SIZE = 128
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Bvh:
 
         Rounded up, so that scenes share compiled kernels.
         """
-        return max(-(-(7 * self.depth + 1) // _STACK_STEP) * _STACK_STEP, _SMALLEST_STACK)
+        return max(-(-(7 * self.depth + 1) // _STACK_STEP) * _STACK_STEP, MIN_STACK_SIZE)
 
 
 def build_bvh(

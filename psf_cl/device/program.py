@@ -24,6 +24,8 @@ _SCALARS: dict[str, type[np.generic]] = {
     "uchar": np.uint8,
     "ushort": np.uint16,
 }
+#: Room for a record of every kind.
+_WARM_UP_BYTES = 4096
 _BUILD_OPTIONS = ("-cl-std=CL1.2", "-cl-kernel-arg-info")
 
 
@@ -84,6 +86,24 @@ class Program:
         except cl.RuntimeError as error:
             raise DeviceError(f"{file} does not build on {device.name}: {error}") from error
 
+    def warm_up(self, *kernels: str) -> None:
+        """Launch ``kernels`` once on zeros, for PoCL generates code at the first launch.
+
+        Only for kernels that do nothing where all their parameters are 0.  Uses a queue of its own
+        and waits for it, so that another thread can go on with the device's.
+        """
+        device = self.device
+        queue = cl.CommandQueue(device.context)
+        zeros = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, _WARM_UP_BYTES)
+        cl.enqueue_fill_buffer(queue, zeros, np.uint8(0), 0, _WARM_UP_BYTES)
+        for name in kernels:
+            kernel = cl.Kernel(self.program, name)
+            for index, (_, spelled, pointer) in enumerate(parameters_of(kernel)):
+                kernel.set_arg(index, zeros if pointer else _SCALARS[spelled](0))
+            group = device.traits.group
+            cl.enqueue_nd_range_kernel(queue, kernel, (group,), (group,))
+        queue.finish()
+
     def bind(self, kernel: str, **arguments: Buffer | int | float | np.generic) -> Launch:
         """Return a launch of ``kernel`` with its arguments set by name.
 
@@ -98,13 +118,22 @@ class Program:
         Raises:
             TypeError: the kernel wants something that is not among them.
         """
-        names = argument_names(cl.Kernel(self.program, kernel))
+        names = [name for name, _, _ in parameters_of(cl.Kernel(self.program, kernel))]
         return self.bind(kernel, **{name: buffers[name] for name in names if name in buffers})
 
 
-def argument_names(kernel: cl.Kernel) -> list[str]:
-    """Return the names of a kernel's arguments in their order."""
-    return [kernel.get_arg_info(index, cl.kernel_arg_info.NAME) for index in range(kernel.num_args)]
+def parameters_of(kernel: cl.Kernel) -> list[tuple[str, str, bool]]:
+    """Return name, type and whether it is a pointer of each of a kernel's parameters."""
+    info = cl.kernel_arg_info
+    return [
+        (
+            kernel.get_arg_info(index, info.NAME),
+            kernel.get_arg_info(index, info.TYPE_NAME).replace(" ", ""),
+            kernel.get_arg_info(index, info.ADDRESS_QUALIFIER)
+            != cl.kernel_arg_address_qualifier.PRIVATE,
+        )
+        for index in range(kernel.num_args)
+    ]
 
 
 def load_program(
@@ -141,15 +170,10 @@ class Launch:
             self.kernel = cl.Kernel(program.program, name)
         except cl.LogicError as error:
             raise TypeError(f"{self.label}: no such kernel") from error
-        self.parameters: dict[str, tuple[int, str, bool]] = {}
-        for index in range(self.kernel.num_args):
-            info = cl.kernel_arg_info
-            pointer = (
-                self.kernel.get_arg_info(index, info.ADDRESS_QUALIFIER)
-                != cl.kernel_arg_address_qualifier.PRIVATE
-            )
-            spelled = self.kernel.get_arg_info(index, info.TYPE_NAME).replace(" ", "")
-            self.parameters[self.kernel.get_arg_info(index, info.NAME)] = (index, spelled, pointer)
+        self.parameters = {
+            name: (index, spelled, pointer)
+            for index, (name, spelled, pointer) in enumerate(parameters_of(self.kernel))
+        }
         missing = self.parameters.keys() - arguments.keys()
         if missing:
             raise TypeError(f"{self.label}: missing {', '.join(sorted(missing))}")

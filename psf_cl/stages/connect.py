@@ -15,4 +15,5 @@ def plan(context: Context) -> StageSpec | None:
         "connect.cl",
         flags=("ALPHA", "AOV_DIRECT"),
         kernels=("connect_lights",),
+        traces=True,
     )

@@ -13,4 +13,5 @@ def plan(context: Context) -> StageSpec:
         "intersect.cl",
         flags=("ALPHA",),
         kernels=("intersect_closest",),
+        traces=True,
     )

@@ -31,6 +31,7 @@ class StageSpec:
     Attributes:
         flags: the features that its source depends on; it is built with the others at 0.
         kernels: those that are launched.
+        traces: whether it traces rays, which takes a stack of the tree's depth.
     """
 
     name: str
@@ -39,7 +40,7 @@ class StageSpec:
     flags: tuple[str, ...] = ()
     kernels: tuple[str, ...] = ()
     buffers: tuple[BufferSpec, ...] = ()
-    planned: bool = True
+    traces: bool = False
 
     @property
     def sources(self) -> tuple[str, ...]:
