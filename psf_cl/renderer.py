@@ -58,7 +58,7 @@ class Renderer:
             raise InputError(f"{scene.path}: no camera")
         self.device = device or open_device(profiling=statistics)
         self.plan: Plan = make_plan(scene, self.settings, outputs, self.device.traits, crop)
-        self.excluded_seconds = 0.0
+        self.compile_seconds = 0.0
         self.statistics = statistics
         self.censuses = 0
         self.depth_counts = np.zeros(OCCUPANCY_BINS)
@@ -79,7 +79,6 @@ class Renderer:
         )
         self.load_seconds = load_end - start
         self.build_seconds = build_end - load_end
-        self.compile_seconds = time.perf_counter() - build_end
 
     # What happens each bounce, in its order.
 
@@ -135,11 +134,9 @@ class Renderer:
         running = clock.started is not None
         self.device.wait()
         clock.stop()
-        begin = time.perf_counter()
         try:
             yield
         finally:
-            self.excluded_seconds += time.perf_counter() - begin
             if running:
                 clock.start()
 
@@ -354,7 +351,8 @@ class Renderer:
         return bvh
 
     def _compile(self, stack_size: int) -> dict[str, Program]:
-        """Build the stages' programs, down to machine code; runs beside the loading of the scene."""
+        """Build the stages' programs, down to machine code; runs beside the scene's loading."""
+        start = time.perf_counter()
         programs = {}
         for stage in self.plan.stages:
             defines = self.plan.defines(stage)
@@ -362,6 +360,7 @@ class Renderer:
                 defines |= {"STACK_SIZE": stack_size}
             programs[stage.name] = load_program(self.device, stage.source, defines)
             programs[stage.name].warm_up(*stage.kernels)
+        self.compile_seconds += time.perf_counter() - start
         return programs
 
     def _bind(self, programs: dict[str, Program]) -> None:

@@ -202,7 +202,8 @@ def alias_table(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         weights: ``(n,)``, finite, none negative, not all zero.
 
     Returns:
-        ``keep``, ``(n,)`` float32 in [0, 1], and ``other``, ``(n,)`` uint32.
+        ``keep``, ``(n,)`` float32 in [0, 1] in steps of 2^-24, the step of the device's ``u``
+        (rounded up, so that nothing with a weight is lost), and ``other``, ``(n,)`` uint32.
 
     Source: the sweep of Huebschle-Schneider, Sanders, "Parallel Weighted Random Sampling", 2019,
     section 4.2, with its two running positions found by search in the running sums.
@@ -225,7 +226,18 @@ def alias_table(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     gave[-1:] = False
     keep[heavy[gave]] = 1.0 + excess[gave] - lack[emptied[gave]]
     other[heavy[:-1]] = heavy[1:]
-    return np.clip(keep, 0.0, 1.0).astype(np.float32), other
+    return (np.ceil(np.clip(keep, 0.0, 1.0) * 2.0**24) / 2.0**24).astype(np.float32), other
+
+
+def alias_chances(keep: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the chance with which an alias table draws each index, ``(n,)`` float64.
+
+    Not quite the weights that it was made from: a density that divides samples has to be this one,
+    or a light of a millionth of the power would come out too bright by the rounding of ``keep``.
+    """
+    chance = keep.astype(np.float64)
+    np.add.at(chance, other, 1.0 - keep.astype(np.float64))
+    return chance / len(keep)
 
 
 def light_table(scene: Scene, geometry: Geometry, sampling: str) -> tuple[np.ndarray, float]:
@@ -298,9 +310,9 @@ def light_table(scene: Scene, geometry: Geometry, sampling: str) -> tuple[np.nda
         if 1.0 - NEAR_SHARE < share < 1.0:
             chance[far] *= (1.0 - NEAR_SHARE) / share
             chance[~far] *= NEAR_SHARE / (1.0 - share)
-    table["pmf"] = chance
     table["keep"], table["other"] = alias_table(chance)
-    return table, float(chance[len(triangles)]) if sky else 0.0
+    table["pmf"] = alias_chances(table["keep"], table["other"])
+    return table, float(table["pmf"][len(triangles)]) if sky else 0.0
 
 
 def _fill_punctual(row: np.void, light: Light) -> None:
@@ -363,8 +375,8 @@ def environment_cells(environment: Environment) -> np.ndarray:
     padded = np.concatenate([columns[:1], columns, columns[-1:]])
     smooth = (padded[:-2] + 6.0 * padded[1:-1] + padded[2:]) / 8.0
     weights = (smooth * _environment_weights(image)).ravel()
-    cells["pmf"] = weights / weights.sum()
     cells["keep"], cells["other"] = alias_table(weights)
+    cells["pmf"] = alias_chances(cells["keep"], cells["other"])
     return cells
 
 

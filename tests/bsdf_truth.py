@@ -127,7 +127,7 @@ def refraction_normal(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
 
 
 def eval_refraction(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
-    """Walter 2007, equation 21, times cosine, for radiance (which carries 1 / eta^2), ``(..., 3)``."""
+    """Walter 2007, equation 21, times cosine, for radiance (so 1 / eta^2), ``(..., 3)``."""
     with np.errstate(all="ignore"):
         h = refraction_normal(b, wo, wi)
         oh, ih = dot(wo, h), dot(wi, h)
@@ -143,7 +143,7 @@ def eval_refraction(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
 
 
 def evaluate(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
-    """f times |cos wi|, ``(..., 3)``."""
+    """Return f times |cos wi|, ``(..., 3)``."""
     return eval_reflection(b, wo, wi) + eval_diffuse(b, wo, wi) + eval_refraction(b, wo, wi)
 
 
@@ -214,7 +214,9 @@ class Lobe:
         side = cells * fine
         step = 1e-3 / side
         # Jittered: a horizon that follows a row of points would be off by half a row.
-        jitter = np.random.default_rng(0).uniform(2 * step * side, 1 - 2 * step * side, (2, side, side))
+        jitter = np.random.default_rng(0).uniform(
+            2 * step * side, 1 - 2 * step * side, (2, side, side)
+        )
         s, t = (np.mgrid[:side, :side] + jitter) / side
         ends = [self.direction(s + step, t), self.direction(s - step, t)]
         ends += [self.direction(s, t + step), self.direction(s, t - step)]
@@ -238,7 +240,7 @@ class Lobe:
         return reflect(self.wo, h) if self.kind == "reflect" else refract(self.wo, h, self.b.eta)
 
     def bin_of(self, wi: np.ndarray) -> np.ndarray:
-        """Index of the bin that each direction is in, ``cells^2`` for one that is not of the lobe."""
+        """Index of the bin that each direction is in, ``cells^2`` where it is not of the lobe."""
         wi = np.asarray(wi, np.float64)
         with np.errstate(all="ignore"):
             if self.kind == "diffuse":
@@ -280,9 +282,7 @@ def albedo(b: Bsdf, wo: np.ndarray) -> np.ndarray:
     kinds = ["reflect"]
     kinds += ["diffuse"] if b.metallic < 1 and b.transmission < 1 else []
     kinds += ["refract"] if b.metallic < 1 and b.transmission > 0 else []
-    return sum(
-        Lobe(kind, b, wo, cells=1, fine=160).integrate(VALUES[kind])[0] for kind in kinds
-    )
+    return sum(Lobe(kind, b, wo, cells=1, fine=160).integrate(VALUES[kind])[0] for kind in kinds)
 
 
 def white(b: Bsdf) -> Bsdf:

@@ -1,4 +1,4 @@
-"""The BSDF: formulas against double precision, sampling against its density, energy, reciprocity."""
+"""The BSDF: formulas against doubles, sampling against its density, energy, reciprocity."""
 
 from functools import cache
 
@@ -42,7 +42,7 @@ def run(device, kernel, inputs, outputs, transmission=1):
 
 
 def sample(device, records, given, wo, numbers, transmission=1):
-    """Return directions ``(n, 3)``, values ``(n, 3)`` and densities ``(n,)``; all arguments ``(n, k)``."""
+    """Return directions and values ``(n, 3)`` and densities ``(n,)``; all arguments ``(n, k)``."""
     wi, values, pdfs = run(
         device,
         "sample_directions",
@@ -69,9 +69,7 @@ def evaluate(device, records, given, wo, wi, side=None, transmission=1):
 def chances(device, records, wo, transmission=1):
     """Return the chances to reflect, refract and scatter, ``(n, 3)``."""
     inputs = {"materials": records.T, "wo": wo.T}
-    return run(
-        device, "list_chances", inputs, {"chances": (np.float32, 3)}, transmission
-    )[0].T
+    return run(device, "list_chances", inputs, {"chances": (np.float32, 3)}, transmission)[0].T
 
 
 def cases_in_turn(cases, count, seed):
@@ -324,7 +322,9 @@ def test_weights_stay_finite_at_the_extremes(lane_device):
     corners = [0.0, 2.0**-24, 0.5, 1 - 2.0**-24]
     numbers = np.stack(np.meshgrid(corners, corners, corners), axis=-1).reshape(-1, 3)
     bsdfs = [
-        Bsdf(base_color=color, roughness=r, metallic=m, specular=s, transmission=t, ior=n, entering=e)
+        Bsdf(
+            base_color=color, roughness=r, metallic=m, specular=s, transmission=t, ior=n, entering=e
+        )
         for color in ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
         for r in (0.0, 0.05, 1.0)
         for m in (0.0, 1.0)

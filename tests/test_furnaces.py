@@ -148,26 +148,19 @@ def schlick(f0, cosine):
 
 
 def microfacets(alpha, angle):
-    """Return wo, microfacet normals of equal weight by D cos, and the weight G / (cos_o cos_h) o.h.
+    """Return wo, microfacet normals h, and weights: D times o.h / cos_o over the density of h.
 
-    Walter et al., "Microfacet Models for Refraction", 2007: the normals by its equation 35, on a
-    grid of midpoints.  The weight is without the part of G that depends on wi.
+    The slopes are those of Walter et al., "Microfacet Models for Refraction", 2007, equation 35, at
+    u = 1 - t^2 on a grid in t, which is fine where facets stand upright and weigh most.
     """
     count = 1000
-    u, v = np.meshgrid((np.arange(count) + 0.5) / count, (np.arange(count) + 0.5) / count)
-    tangent = alpha * np.sqrt(u / (1 - u))
+    t, v = np.meshgrid((np.arange(count) + 0.5) / count, (np.arange(count) + 0.5) / count)
+    tangent = alpha * np.sqrt(1 - t**2) / t
     cosine = 1 / np.sqrt(1 + tangent**2)
-    h = np.stack(
-        [
-            tangent * cosine * np.cos(2 * np.pi * v),
-            tangent * cosine * np.sin(2 * np.pi * v),
-            cosine,
-        ],
-        axis=-1,
-    )
+    sine = tangent * cosine
+    h = np.stack([sine * np.cos(2 * np.pi * v), sine * np.sin(2 * np.pi * v), cosine], axis=-1)
     wo = np.array([np.sin(angle), 0.0, np.cos(angle)])
-    oh = h @ wo
-    return wo, h, np.maximum(oh, 0.0) / (wo[2] * cosine)
+    return wo, h, 2 * t * np.maximum(h @ wo, 0.0) / (wo[2] * cosine)
 
 
 def masking_lambda(cosine, alpha):
@@ -216,12 +209,14 @@ def diffuse_under_coat(angle):
     return (1 - schlick(0.04, cos_h)).mean()
 
 
-def seen_under_white_sky(device, material, degrees, side=1.0, spp=1024):
-    """Return the radiance of a plane of ``material``, seen at ``degrees`` from its normal."""
+def seen_under_white_sky(device, material, degrees, side=1.0):
+    """Return the radiance of a plane of ``material``, seen at ``degrees``, and its error."""
     angle = np.radians(degrees)
     view = camera((50 * np.sin(angle), 50 * side * np.cos(angle), 0), (0, 0, 0), 0.5, up=(0, 0, 1))
     scene = build([floor(20.0, material)], view, (8, 8), environment=1.0)
-    return render(device, scene, spp, max_depth=1).rgb.mean(axis=(0, 1), dtype=np.float64)
+    image = render(device, scene, 2048, ["variance"], sampler="random", max_depth=1)
+    means, variances = luminance_blocks(image, 1)
+    return means.item(), np.sqrt(variances).item()
 
 
 ANGLES = [0, 45, 75]
@@ -233,24 +228,24 @@ def test_white_metal_reflects_what_quadrature_says_and_never_more_than_it_gets(
     device, roughness, degrees
 ):
     metal = Material(base_color=(1.0, 1.0, 1.0), metallic=1.0, roughness=roughness)
-    seen = seen_under_white_sky(device, metal, degrees)
+    seen, noise = seen_under_white_sky(device, metal, degrees)
     truth = reflected(roughness**2, np.radians(degrees), np.ones_like)
-    np.testing.assert_allclose(seen, truth, rtol=0.004)
-    assert seen.max() < 1.001
+    assert abs(seen - truth) < Z_LIMIT * noise + 1e-3 * truth
+    assert seen < 1.001
+    assert noise < 0.005
 
 
 @pytest.mark.parametrize("roughness", [0.2, 0.6, 1.0])
 @pytest.mark.parametrize("degrees", ANGLES)
-def test_white_plastic_reflects_what_quadrature_says_and_never_more_than_it_gets(
-    device, roughness, degrees
-):
-    seen = seen_under_white_sky(
+def test_white_plastic_reflects_what_quadrature_says(device, roughness, degrees):
+    seen, noise = seen_under_white_sky(
         device, Material(base_color=(1.0, 1.0, 1.0), roughness=roughness), degrees
     )
     angle = np.radians(degrees)
     coat = reflected(roughness**2, angle, lambda cosine: schlick(0.04, cosine))
-    np.testing.assert_allclose(seen, coat + diffuse_under_coat(angle), rtol=0.004)
-    assert seen.max() < 1.001
+    truth = coat + diffuse_under_coat(angle)
+    assert abs(seen - truth) < Z_LIMIT * noise + 1e-3 * truth
+    assert noise < 0.005
 
 
 @pytest.mark.parametrize("roughness", [0.1, 0.5, 0.9])
@@ -260,12 +255,13 @@ def test_glass_boundary_reflects_and_refracts_what_quadrature_says(
     device, roughness, degrees, side
 ):
     glass = Material(base_color=(1.0, 1.0, 1.0), roughness=roughness, transmission=1.0, ior=1.5)
-    seen = seen_under_white_sky(device, glass, degrees, side)
+    seen, noise = seen_under_white_sky(device, glass, degrees, side)
     eta = 1.5 if side > 0 else 1 / 1.5
     alpha, angle = roughness**2, np.radians(degrees)
     truth = reflected(alpha, angle, lambda cosine: fresnel(cosine, eta))
     truth += refracted(alpha, angle, eta)
-    np.testing.assert_allclose(seen, truth, rtol=0.006)
+    assert abs(seen - truth) < Z_LIMIT * noise + 1e-3 * truth
+    assert noise < 0.006
 
 
 @pytest.mark.parametrize("shape", ["smooth sphere", "faceted sphere", "box"])

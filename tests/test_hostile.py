@@ -1,4 +1,4 @@
-"""Input that is wrong, broken or hostile: one line that names it, exit code 2, nothing left behind."""
+"""Input that is wrong, broken or hostile: one line that names it, exit code 2, no file left."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import io
 import json
 import os
 import struct
-import subprocess
-import sys
 import zlib
 from pathlib import Path
 
@@ -16,7 +14,7 @@ import PIL.Image
 import pytest
 
 from psf_cl.cli.main import main
-from psf_cl.image import Image, read_exr, write_exr
+from psf_cl.image import Image, write_exr
 
 SCENE = '[[shapes]]\nprimitive = "quad"\n'
 RUN = "--size 8x8 --spp 1 -o out.exr"
@@ -62,7 +60,9 @@ def png(width: int, height: int, pixels: bytes) -> bytes:
     """Return a PNG whose header claims a size, whatever the pixels are."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
 
     header = struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)
     return (
@@ -111,7 +111,11 @@ BAD_SCENES: dict[str, tuple[str, object, str]] = {
     "a byte order mark": ("a.toml", b"\xef\xbb\xbf[film", "a.toml"),
     "half a key": ("a.toml", SCENE + "[film]\nwidth =", "a.toml"),
     "deep nesting": ("a.toml", "a = " + "[" * 100000, "a.toml"),
-    "unknown key": ("a.toml", SCENE + "[film]\nwidht = 4", "film.widht: unknown key; did you mean width?"),
+    "unknown key": (
+        "a.toml",
+        SCENE + "[film]\nwidht = 4",
+        "film.widht: unknown key; did you mean",
+    ),
     "unknown table": ("a.toml", SCENE + "[flim]\nwidth = 4", "flim"),
     "wrong type": ("a.toml", SCENE + "[film]\nwidth = '4'", "film.width"),
     "wrong length": ("a.toml", SCENE + "[camera]\nposition = [1, 2]", "camera.position"),
@@ -153,7 +157,7 @@ BAD_SCENES: dict[str, tuple[str, object, str]] = {
         ),
         "no.bin",
     ),
-}  # fmt: skip
+}
 
 # Options after ``render good.toml``, and what the error has to say.
 BAD_OPTIONS = {

@@ -113,7 +113,7 @@ def test_unit_numbers_are_below_one_and_keep_24_bits(lane_device):
 
 @pytest.mark.parametrize("seed", [0, 12345])
 def test_every_elementary_interval_holds_one_point(lane_device, seed):
-    """The first 2^k samples of a pixel, and each later run of 2^k: the definition of a (0, 2)-sequence."""
+    """The first 2^k samples of a pixel, and each later run of 2^k: what a (0, 2)-sequence is."""
     pixels, pairs = [0, 77, 123456], [0, 2, 3, 41]
     count = 1 << 10
     bits, _ = draw(lane_device, pixels, np.arange(4 * count), pairs, seed=seed)

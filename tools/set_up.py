@@ -105,7 +105,10 @@ def working_device() -> tuple[str, list[str]]:
     """Return the first device that passes the self-test, or "", and what is wrong instead."""
     done = subprocess.run(
         [str(VENV_PYTHON), "-m", "psf_cl.device.selftest"],
-        cwd=ROOT, capture_output=True, text=True, check=False,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     failures = []
     for line in done.stdout.splitlines():

@@ -151,7 +151,7 @@ inline Float pdf_ggx_reflect(Vec3 wo, Vec3 h, Float alpha)
 /// f(wo, wi) |cos wi|, and the density with which sample_bsdf draws wi.
 ///
 /// `wi_side` > 0 where wi is on wo's side of the real surface: shading normals must not leak light.
-inline Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Float wi_side, Float *pdf)
+LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Float wi_side, Float *pdf)
 {
     const Mask above = (wi.z > 0.0f) & (wi_side > 0.0f);
     const Float cos_i = pick(above, wi.z, (Float)(1.0f));

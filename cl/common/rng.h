@@ -71,7 +71,7 @@ inline Float unit_float(UInt x) { return to_float(x >> 8) * 5.9604645e-8f; }
 inline UInt pixel_seed(UInt pixel, uint seed) { return mix_bits(pixel ^ mix_bits((UInt)(seed ^ 0x9e3779b9u))); }
 
 /// Two uniform 32-bit numbers, stratified over the samples of a pixel if the sampler is Sobol'.
-inline void sample_bits(UInt seed, UInt index, UInt pair, uint sampler, UInt *first, UInt *second)
+LARGE_FUNCTION void sample_bits(UInt seed, UInt index, UInt pair, uint sampler, UInt *first, UInt *second)
 {
     const UInt key = mix_bits(seed + pair * 0x9e3779b9u);
     if (sampler == SAMPLER_SOBOL) {

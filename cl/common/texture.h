@@ -73,7 +73,7 @@ inline float2 triangle_uv(__global const Uvs *uvs, uint triangle, float u, float
 }
 
 /// Multiply `color` by a texture in the lanes of `mask`; `texture` may be NO_TEXTURE.
-inline Vec3 textured(
+LARGE_FUNCTION Vec3 textured(
     Mask mask,
     Vec3 color,
     UInt texture,

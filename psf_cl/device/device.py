@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -62,7 +61,6 @@ class Device:
         self.queue = cl.CommandQueue(self.context, properties=flags)
         self.allocated_bytes = 0
         self.peak_bytes = 0
-        self.compile_seconds = 0.0
         self.programs: dict[tuple[Any, ...], Program] = {}
         self.events: list[tuple[str, int, cl.Event]] = []
         self.totals: dict[str, tuple[int, float, int]] = {}
@@ -179,13 +177,6 @@ class Device:
             spent = (event.profile.end - event.profile.start) * 1e-9
             self.totals[name] = (launches + 1, seconds + spent, done + items)
         self.events.clear()
-
-    def timed_compile(self, work: Any) -> Any:
-        """Call ``work()`` and add its time to ``compile_seconds``."""
-        start = time.perf_counter()
-        result = work()
-        self.compile_seconds += time.perf_counter() - start
-        return result
 
 
 def list_devices() -> list[cl.Device]:

@@ -80,9 +80,7 @@ class Program:
         ]
         source = assemble(file, folder)
         try:
-            self.program = device.timed_compile(
-                lambda: cl.Program(device.context, source).build(options=options)
-            )
+            self.program = cl.Program(device.context, source).build(options=options)
         except cl.RuntimeError as error:
             raise DeviceError(f"{file} does not build on {device.name}: {error}") from error
 
