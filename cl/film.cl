@@ -23,12 +23,12 @@ inline void add_sample(__global FilmSum *sum, volatile __global uint *counters, 
 {
     if (sample.w <= 0.0f)
         return;
-    // On bits: a compiler may assume that no float is NaN.
+    // On bits: a compiler may assume that no float is NaN.  From 2^96 on, sums could overflow.
     uint bad = 0;
-    const uint4 bits = as_uint4(sample);
-    bad |= (bits.x & 0x7f800000u) == 0x7f800000u;
-    bad |= (bits.y & 0x7f800000u) == 0x7f800000u;
-    bad |= (bits.z & 0x7f800000u) == 0x7f800000u;
+    const uint4 exponents = as_uint4(sample) & 0x7f800000u;
+    bad |= exponents.x >= 0x6f800000u;
+    bad |= exponents.y >= 0x6f800000u;
+    bad |= exponents.z >= 0x6f800000u;
     if (bad) {
         atomic_inc(&counters[COUNTER_REJECTED_SAMPLES]);
         sample.x = 0.0f;
@@ -43,7 +43,7 @@ inline void add_sample(__global FilmSum *sum, volatile __global uint *counters, 
     const float y = 0.2126f * sample.x + 0.7152f * sample.y + 0.0722f * sample.z;
     const float delta = y - sum->mean;
     sum->mean += delta / (float)sum->count;
-    sum->squares += delta * (y - sum->mean);
+    sum->squares = min(sum->squares + delta * (y - sum->mean), FLT_MAX);
 }
 
 /// Add every complete pass to the film.  One work item a pixel and plane.

@@ -1,8 +1,6 @@
 """``python -m psf_cl`` is ``psf-cl``."""
 
-import sys
-
-from psf_cl.cli.main import main
+from psf_cl.cli.main import program
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program()

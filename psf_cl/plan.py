@@ -272,7 +272,7 @@ def _scene_buffers(context: Context, scene: Scene, used: set[int]) -> tuple[Buff
             BufferSpec(
                 "textures", layout.TEXTURE.dtype, context.texture_count, "where textures lie"
             ),
-            BufferSpec("texels", uint8, 4 * context.texel_count, "texels of all textures"),
+            BufferSpec("texels", uint8, 4 * max(context.texel_count, 1), "texels of all textures"),
             BufferSpec("srgb_to_linear", float32, 256, "decoding table"),
         ]
     if lights:

@@ -63,7 +63,8 @@ class Renderer:
         self.censuses = 0
         self.depth_counts = np.zeros(OCCUPANCY_BINS)
         self.buffers: dict[str, Buffer] = {}
-        with ThreadPoolExecutor(1) as background:
+        background = ThreadPoolExecutor(1)
+        try:
             compiling = background.submit(self._compile, MIN_STACK_SIZE)
             self._allocate()
             geometry = self._upload_scene()
@@ -71,6 +72,9 @@ class Renderer:
             self.bvh: Bvh = self._build_bvh(geometry)
             build_end = time.perf_counter()
             programs = compiling.result()
+        finally:
+            # An error or Ctrl-C is told now, not when the compiler has come to its end.
+            background.shutdown(wait=False)
         if self.bvh.stack_size != MIN_STACK_SIZE:
             programs = self._compile(self.bvh.stack_size)
         self._bind(programs)

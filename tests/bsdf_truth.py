@@ -209,7 +209,7 @@ class Lobe:
         fine: quadrature points along each side of a bin.
     """
 
-    def __init__(self, kind: str, b: Bsdf, wo: np.ndarray, cells: int = 12, fine: int = 12) -> None:
+    def __init__(self, kind: str, b: Bsdf, wo: np.ndarray, cells: int = 12, fine: int = 8) -> None:
         self.kind, self.b, self.wo, self.cells = kind, b, np.asarray(wo, np.float64), cells
         side = cells * fine
         step = 1e-3 / side

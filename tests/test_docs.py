@@ -41,6 +41,20 @@ def test_the_documented_scene_loads(tmp_path):
     assert scene.shapes[2].transform[:3, 1] == pytest.approx([0.0, -0.3, 0.0], abs=1e-12)
 
 
+def test_the_python_example_of_the_readme_runs(device, tmp_path, monkeypatch, capsys):
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    scene = ROOT / "scenes" / "cornell_box.toml"
+    short = {'"scenes/cornell_box.toml"': repr(str(scene)), "seconds=10.0": "seconds=0.01"}
+    for text, replacement in short.items():
+        assert text in example
+        example = example.replace(text, replacement)
+    monkeypatch.chdir(tmp_path)
+    exec(example, {})
+    assert re.fullmatch(r"\(512, 512, 3\) [1-9]\d*\n", capsys.readouterr().out)
+    assert (tmp_path / "box.exr").is_file()
+
+
 def test_links_lead_somewhere():
     for document in [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")]:
         for target in re.findall(r"\]\((?!https?:)([^)#]+)", document.read_text(encoding="utf-8")):

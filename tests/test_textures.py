@@ -129,12 +129,12 @@ def test_coordinates_without_meaning_read_a_texel_of_the_texture(textured):
     uv = np.tile(pairs, (len(TEXTURES), 1)).T
     found = textured("look_up", {"index": index, "uv": np.ascontiguousarray(uv)}, 4)
     assert np.isfinite(found).all()
-    low = np.array([look_up_all(t).min(axis=0) for t in TEXTURES])[index]
-    high = np.array([look_up_all(t).max(axis=0) for t in TEXTURES])[index]
+    low = np.array([colors_of(t).min(axis=0) for t in TEXTURES])[index]
+    high = np.array([colors_of(t).max(axis=0) for t in TEXTURES])[index]
     assert (found >= low - 1e-6).all() and (found <= high + 1e-6).all()
 
 
-def look_up_all(texture):
+def colors_of(texture):
     rgba = texture.pixels.reshape(-1, 4) / 255.0
     if texture.srgb:
         rgba[:, :3] = decode(texture.pixels.reshape(-1, 4)[:, :3])
@@ -176,11 +176,11 @@ def test_points_of_triangles_are_multiplied_by_their_texture(textured, lane_devi
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-5)
 
 
-def cut_out_scene(alpha, wrap="repeat", uv_scale=1.0, **material):
+def cut_out_scene(texels, wrap="repeat", uv_scale=1.0, **material):
     """Return a black quad that fills the view, its alpha by texels, before a white sky."""
     size = 16
-    pixels = np.zeros((*np.shape(alpha), 4), np.uint8)
-    pixels[..., 3] = alpha
+    pixels = np.zeros((*np.shape(texels), 4), np.uint8)
+    pixels[..., 3] = texels
     texture = Texture("holes", pixels, wrap=(wrap, wrap), filter="nearest")
     mesh = Mesh(
         "quad",
@@ -237,10 +237,9 @@ def test_holes_repeat_with_their_texture(device):
 
 def test_holes_let_light_through_to_other_surfaces(device):
     """Shadow rays too: a white floor behind the quad is lit where the quad is not."""
-    alpha = np.zeros((1, 1))
-    scene = cut_out_scene(alpha)
+    scene = cut_out_scene(np.zeros((1, 1)))
     floor = Material("floor", base_color=(0.5, 0.5, 0.5), specular=0.0)
-    behind = np.eye(4)
+    behind = np.diag([2.0, 2.0, 1.0, 1.0])
     behind[2, 3] = -0.01
     mesh = scene.shapes[0].mesh
     light = Light("directional", (2.0, 2.0, 2.0), direction=(0.0, 0.0, -1.0))
@@ -250,4 +249,3 @@ def test_holes_let_light_through_to_other_surfaces(device):
     image = psf_cl.render(scene, spp=2, device=device, max_depth=1)
     # Lambert: albedo / pi times lux times cosine 1.
     np.testing.assert_allclose(image.aovs["rgb"], 0.5 / np.pi * 2.0, rtol=1e-5)
-

@@ -76,7 +76,7 @@
 #define COUNTER_BOUNCE_RAYS_HIGH 7u // high word
 #define COUNTER_SHADOW_RAYS 8u // low word
 #define COUNTER_SHADOW_RAYS_HIGH 9u // high word
-#define COUNTER_REJECTED_SAMPLES 10u // samples that were not finite or negative
+#define COUNTER_REJECTED_SAMPLES 10u // samples that were not finite, or too large to be summed
 #define COUNTER_PENDING_CAMERA 11u // rays since the last film launch
 #define COUNTER_PENDING_BOUNCE 12u
 #define COUNTER_PENDING_SHADOW 13u

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import io
 import os
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 import psf_cl
 from psf_cl.cli import compare, doctor, plan, render
@@ -44,6 +46,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
 
 
+def program() -> NoReturn:
+    """Run one command and end the process with its exit code.
+
+    At once: an interrupted command may leave a thread in a compiler, which cannot be stopped and
+    crashes when the libraries are unloaded below it.
+    """
+    code = main()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(BrokenPipeError):
+            stream.flush()
+    os._exit(code)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = Parser(prog="psf-cl", description="Path tracing on any OpenCL device.")
     parser.add_argument("--version", action="version", version=f"psf-cl {psf_cl.__version__}")
@@ -59,4 +74,4 @@ def _fail(message: str, code: int) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    program()

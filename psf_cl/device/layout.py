@@ -283,7 +283,7 @@ COUNTERS = (
     ("bounce_rays_high", "high word"),
     ("shadow_rays", "low word"),
     ("shadow_rays_high", "high word"),
-    ("rejected_samples", "samples that were not finite or negative"),
+    ("rejected_samples", "samples that were not finite, or too large to be summed"),
     ("pending_camera", "rays since the last film launch"),
     ("pending_bounce", ""),
     ("pending_shadow", ""),

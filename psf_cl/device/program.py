@@ -52,9 +52,11 @@ def assemble(file: str, folder: Path | None = None) -> str:
             target = (path.parent / match.group(1)).resolve()
             if not target.is_file():
                 raise DeviceError(f"{shown}:{number}: no file {match.group(1)}")
-            if target not in seen:
-                lines += expand(target)
-                lines.append(f'#line {number + 1} "{shown}"')
+            if target in seen:
+                lines.append("")
+                continue
+            lines += expand(target)
+            lines.append(f'#line {number + 1} "{shown}"')
         return lines
 
     return "\n".join(expand((folder / file).resolve())) + "\n"
@@ -207,7 +209,13 @@ class Launch:
             return value.memory
         if spelled not in _SCALARS:
             raise TypeError(f"{self.label}: {name} has the unsupported type {spelled}")
-        return _SCALARS[spelled](value)
+        scalar = _SCALARS[spelled]
+        if isinstance(value, int | np.integer):
+            if spelled != "float" and not np.iinfo(scalar).min <= value <= np.iinfo(scalar).max:
+                raise TypeError(f"{self.label}: {name} is {spelled}, got {value}")
+        elif spelled != "float" or not isinstance(value, float | np.floating):
+            raise TypeError(f"{self.label}: {name} is {spelled}, got {type(value).__name__}")
+        return scalar(value)
 
     def __call__(self, items: int, group: int | None = None) -> None:
         """Enqueue ``items`` work items (0 does nothing)."""

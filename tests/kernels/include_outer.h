@@ -1,0 +1,3 @@
+#pragma once
+#include "include_inner.h"
+#define OUTER (INNER * 100)

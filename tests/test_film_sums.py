@@ -1,0 +1,262 @@
+"""The film: sums of whole passes, in their order, whatever the order in which samples come."""
+
+import numpy as np
+import pytest
+
+from psf_cl.device import layout
+from psf_cl.device.program import load_program
+
+AT = layout.COUNTER_INDEX
+
+
+class Film:
+    """add_samples and advance_film on buffers of their own."""
+
+    def __init__(self, device, pixel_count, ring, planes=1):
+        self.device, self.pixel_count, self.ring, self.planes = device, pixel_count, ring, planes
+        params = np.zeros(1, layout.PARAMS.dtype)
+        params["pixel_count"], params["ring"] = pixel_count, ring
+        film = np.zeros(planes * pixel_count, layout.FILM_SUM.dtype)
+        self.buffers = {
+            "params": device.upload("params", params),
+            "samples": device.allocate("samples", np.float32, planes * ring * pixel_count * 4),
+            "counters": device.allocate("counters", np.uint32, AT["finished"] + ring),
+            "film": device.upload("film", film),
+        }
+        program = load_program(device, "film.cl")
+        self.add, self.add_partial = (
+            program.bind("add_samples", planes=planes, partial=partial, **self.buffers)
+            for partial in (0, 1)
+        )
+        self.advance = program.bind(
+            "advance_film", params=self.buffers["params"], counters=self.buffers["counters"]
+        )
+        self.limit(2**31)
+
+    def count(self, name, index=0):
+        return int(self.device.read(self.buffers["counters"], 1, AT[name] + index)[0])
+
+    def set(self, name, value, index=0):
+        values = np.array([value], np.uint32)
+        self.device.write(self.buffers["counters"], values, AT[name] + index)
+
+    def limit(self, passes):
+        self.set("pass_limit", passes)
+
+    def put(self, pass_index, samples, done=True):
+        """Write the samples of a pass, ``(planes, pixels, 4)``, into its place of the ring."""
+        slot = pass_index % self.ring
+        samples = np.broadcast_to(samples, (self.planes, self.pixel_count, 4)).astype(np.float32)
+        for plane in range(self.planes):
+            at = (plane * self.ring + slot) * self.pixel_count * 4
+            self.device.write(self.buffers["samples"], samples[plane].ravel(), at)
+        if done:
+            self.set("finished", self.pixel_count, slot)
+
+    def launch(self):
+        self.add(self.planes * self.pixel_count, 8)
+        self.advance(1)
+
+    def read(self):
+        return self.device.read(self.buffers["film"]).reshape(self.planes, -1)
+
+    def release(self):
+        self.device.release(*self.buffers.values())
+
+
+@pytest.fixture
+def film(device):
+    made = []
+
+    def build(*arguments, **options):
+        made.append(Film(device, *arguments, **options))
+        return made[-1]
+
+    yield build
+    for item in made:
+        item.release()
+
+
+def passes_of(count, pixels, seed=0):
+    """Return positive samples of weight 1 that span six decades, ``(count, pixels, 4)``."""
+    rng = np.random.default_rng(seed)
+    samples = (10.0 ** rng.uniform(-3, 3, (count, pixels, 4))).astype(np.float32)
+    samples[..., 3] = 1
+    return samples
+
+
+def sums_of(film):
+    return film["sum"].astype(np.float64) - film["lost"]
+
+
+def test_sums_means_and_variances_equal_double_precision(film):
+    passes = passes_of(100, 37)
+    f = film(37, ring=4)
+    for k, samples in enumerate(passes):
+        f.put(k, samples)
+        f.launch()
+    (found,) = f.read()
+    exact = passes.astype(np.float64)
+    np.testing.assert_array_equal(found["count"], 100)
+    np.testing.assert_allclose(sums_of(found), exact[..., :3].sum(axis=0), rtol=2e-7)
+    level = exact[..., :3] @ [0.2126, 0.7152, 0.0722]
+    np.testing.assert_allclose(found["mean"], level.mean(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(found["squares"] / 99, level.var(axis=0, ddof=1), rtol=1e-4)
+
+
+def test_sums_go_on_growing_when_a_sample_is_far_below_their_last_digit(film):
+    f = film(8, ring=8)
+    f.put(0, [1e6, 1e6, 1e6, 1])
+    f.launch()
+    # A plain sum of floats would stay at 1e6: the step there is 0.0625.
+    for start in range(1, 2001, 8):
+        for k in range(start, start + 8):
+            f.put(k, [0.01, 0.02, 0.03, 1])
+        f.launch()
+    (found,) = f.read()
+    assert f.count("film_pass") == 2001
+    expected = 1e6 + 2000 * np.array([0.01, 0.02, 0.03])
+    np.testing.assert_allclose(sums_of(found), np.tile(expected, (8, 1)), rtol=0, atol=2e-3)
+
+
+def test_samples_that_are_not_finite_are_counted_and_left_out(film):
+    samples = np.ones((16, 4))
+    bad = [np.nan, np.inf, -np.inf, -np.nan]
+    for k, value in enumerate(bad):
+        for channel in range(3):
+            samples[3 * k + channel, channel] = value
+    f = film(16, ring=2)
+    f.put(0, samples)
+    f.put(1, np.full((16, 4), [2.0, 3.0, 4.0, 1.0]))
+    f.launch()
+    (found,) = f.read()
+    assert f.count("rejected_samples") == 12
+    good = np.arange(16)[:, None] >= 12
+    np.testing.assert_array_equal(found["sum"], np.where(good, [3, 4, 5], [2, 3, 4]))
+    # A rejected sample counts as black: the mean must not depend on how many there were.
+    np.testing.assert_array_equal(found["count"], 2)
+    for name in ("sum", "lost", "mean", "squares"):
+        assert np.isfinite(found[name]).all()
+
+
+def test_values_are_summed_up_to_where_sums_could_overflow(film):
+    largest = float(np.nextafter(np.float32(2.0**96), np.float32(0)))
+    f = film(3, ring=1)
+    f.put(0, [[[-1.0, 0.0, largest, 1.0]] * 3])
+    f.launch()
+    (found,) = f.read()
+    np.testing.assert_array_equal(found["sum"], np.float32([[-1.0, 0.0, largest]] * 3))
+    assert f.count("rejected_samples") == 0
+    f.put(1, [2.0**96, 1.0, 1.0, 1.0])
+    f.launch()
+    assert f.count("rejected_samples") == 3
+    (found,) = f.read()
+    np.testing.assert_array_equal(found["sum"], np.float32([[-1.0, 0.0, largest]] * 3))
+    assert np.isfinite(found["squares"]).all()
+
+
+def test_samples_without_weight_are_no_samples(film):
+    samples = np.ones((10, 4))
+    samples[::2, 3] = 0
+    samples[::2, 0] = np.nan
+    f = film(10, ring=1)
+    f.put(0, samples)
+    f.launch()
+    (found,) = f.read()
+    np.testing.assert_array_equal(found["count"], [0, 1] * 5)
+    np.testing.assert_array_equal(found["sum"][:, 0], [0, 1] * 5)
+    assert f.count("rejected_samples") == 0
+
+
+def test_passes_are_added_whole_and_in_order(film):
+    """Pass 1 is ready before pass 0: nothing may be added, then both."""
+    passes = passes_of(2, 11, seed=1)
+    f = film(11, ring=4)
+    f.put(1, passes[1])
+    f.launch()
+    assert f.count("film_pass") == 0 and not f.read()["count"].any()
+    f.put(0, passes[0], done=False)
+    f.set("finished", 10, 0)
+    f.launch()
+    assert f.count("film_pass") == 0 and not f.read()["count"].any()
+    f.set("finished", 11, 0)
+    f.launch()
+    assert f.count("film_pass") == 2
+    np.testing.assert_array_equal(f.read()["count"], 2)
+    # Their counts are cleared for the passes that come round next.
+    assert [f.count("finished", k) for k in range(4)] == [0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("ring", [1, 2, 8])
+def test_bits_do_not_depend_on_ring_or_order_of_completion(film, ring):
+    passes = passes_of(24, 19, seed=2)
+    one = film(19, ring=1)
+    for k, samples in enumerate(passes):
+        one.put(k, samples)
+        one.launch()
+    other = film(19, ring=ring)
+    rng = np.random.default_rng(ring)
+    for start in range(0, 24, ring):
+        # Every order within what the ring may hold; the film is asked after each pass.
+        for k in rng.permutation(np.arange(start, start + ring)):
+            other.put(int(k), passes[k])
+            other.launch()
+    assert other.count("film_pass") == 24
+    assert one.read().tobytes() == other.read().tobytes()
+
+
+def test_passes_beyond_the_limit_wait(film):
+    passes = passes_of(3, 5)
+    f = film(5, ring=4)
+    f.limit(2)
+    for k in range(3):
+        f.put(k, passes[k])
+    f.launch()
+    assert f.count("film_pass") == 2
+    np.testing.assert_array_equal(f.read()["count"], 2)
+    f.limit(3)
+    f.launch()
+    assert f.count("film_pass") == 3
+    exact = passes[..., :3].astype(np.float64).sum(axis=0)
+    np.testing.assert_allclose(sums_of(f.read()[0]), exact, rtol=2e-7)
+
+
+def test_partial_passes_add_the_samples_that_are_there(film):
+    samples = passes_of(1, 12)[0]
+    samples[5:, 3] = 0
+    f = film(12, ring=4)
+    f.put(0, samples, done=False)
+    f.put(1, np.ones(4), done=False)
+    f.set("finished", 5, 0)
+    f.add_partial(12, 8)
+    (found,) = f.read()
+    np.testing.assert_array_equal(found["count"], [1] * 5 + [0] * 7)
+    np.testing.assert_array_equal(found["sum"][:5], samples[:5, :3])
+    assert not found["sum"][5:].any()
+    assert f.count("film_pass") == 0
+
+
+def test_planes_keep_apart(film):
+    samples = np.stack([passes_of(1, 9, seed)[0] for seed in range(3)])
+    f = film(9, ring=2, planes=3)
+    for k in range(3):
+        f.put(k, samples * (k + 1) * [1, 1, 1, 1 / (k + 1)])
+        f.launch()
+    found = f.read()
+    np.testing.assert_allclose(sums_of(found), samples[..., :3] * 6.0, rtol=1e-6)
+    np.testing.assert_array_equal(found["count"], 3)
+
+
+def test_counters_of_rays_carry_into_their_high_words_and_the_queue_stays_small(film):
+    f = film(10, ring=2)
+    f.set("camera_rays", 2**32 - 5)
+    f.set("pending_camera", 7)
+    f.set("bounce_rays", 100)
+    f.set("pending_bounce", 11)
+    f.set("next_pixel", 37)
+    f.set("next_pass", 4)
+    f.launch()
+    assert (f.count("camera_rays"), f.count("camera_rays_high")) == (2, 1)
+    assert (f.count("bounce_rays"), f.count("bounce_rays_high")) == (111, 0)
+    assert f.count("pending_camera") == f.count("pending_bounce") == 0
+    assert (f.count("next_pass"), f.count("next_pixel")) == (7, 7)

@@ -1,0 +1,258 @@
+"""The plan: what a scene does not need is not compiled, not launched and not allocated."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene_builder import (
+    IDENTITY,
+    build,
+    camera,
+    floor,
+    glowing,
+    inside_out,
+    lambertian,
+    renderer,
+)
+
+from psf_cl.device.device import open_device
+from psf_cl.device.program import assemble, load_program
+from psf_cl.device.sources import kernel_folder
+from psf_cl.errors import InputError
+from psf_cl.plan import AOVS, make_plan
+from psf_cl.scene import primitives, transform
+from psf_cl.scene.model import Environment, Light, Material, Texture
+from psf_cl.settings import Settings
+
+LEVELS = Texture("levels", np.full((2, 2, 4), 128, np.uint8))
+LIFTED = transform.translation((0, 0.5, 0)) @ transform.scaling(0.3)
+LOW = transform.translation((0, 0.2, 0))
+FLAT_QUAD = primitives.quad()
+
+#: What a flag of the plan needs: shapes, lights, a sky, a lens or an AOV.
+PARTS = {
+    "TEXTURES": (FLAT_QUAD, LIFTED, lambertian(0.5, base_color_texture=0)),
+    "ALPHA": (FLAT_QUAD, LOW, lambertian(0.5, alpha=0.2, alpha_mode="mask")),
+    "SMOOTH": (primitives.sphere(8, 6), LIFTED, lambertian(0.5)),
+    "TRANSMISSION": (primitives.box(), LIFTED, Material(transmission=1.0, roughness=0.3)),
+    "AREA_LIGHTS": (inside_out(FLAT_QUAD), LIFTED, glowing(3.0)),
+}
+LIGHTS = {"PUNCTUAL_LIGHTS": Light("point", (1.0, 1.0, 1.0), position=(0.0, 1.0, 1.0))}
+SKIES = {
+    "ENVIRONMENT": Environment((1.0, 1.0, 1.0)),
+    "ENVIRONMENT image": Environment((1.0, 1.0, 1.0), np.ones((2, 4, 3), np.float32)),
+}
+OUTPUTS = {"AOV_DIRECT": "direct", "AOV_FEATURES": "albedo"}
+CHOICES = [*PARTS, *LIGHTS, *SKIES, "LENS", *OUTPUTS]
+
+ALWAYS = {
+    *("params", "blocks", "nodes", "surfaces", "materials"),
+    *("pool", "pixel_order", "counters", "samples", "film"),
+}
+TEXTURE_BUFFERS = {"uvs", "textures", "texels", "srgb_to_linear"}
+NEEDED = {
+    "TEXTURES": TEXTURE_BUFFERS,
+    "ALPHA": TEXTURE_BUFFERS,
+    "SMOOTH": {"normals"},
+    "AREA_LIGHTS": {"lights"},
+    "PUNCTUAL_LIGHTS": {"lights"},
+    "ENVIRONMENT": {"lights"},
+    "ENVIRONMENT image": {"lights", "environment"},
+    "AOV_DIRECT": {"direct", "film_direct"},
+    "AOV_FEATURES": {"features", "film_features"},
+}
+
+
+def with_flags(*flags):
+    """Return a scene that needs these flags and no other, and the outputs to ask for."""
+    lens = {"lens_radius": 0.05, "focus_distance": 3.0} if "LENS" in flags else {}
+    sky = next((SKIES[flag] for flag in flags if flag in SKIES), Environment())
+    scene = build(
+        [floor(2.0, lambertian(0.5)), *(PARTS[flag] for flag in flags if flag in PARTS)],
+        camera((0, 1.5, 3), (0, 0.3, 0), 40, **lens),
+        (8, 8),
+        lights=[LIGHTS[flag] for flag in flags if flag in LIGHTS],
+        environment=sky,
+        textures=[LEVELS] if "TEXTURES" in flags else (),
+    )
+    return scene, [OUTPUTS[flag] for flag in flags if flag in OUTPUTS]
+
+
+def values_of(flags):
+    """Return the macros that are not 0 for these flags."""
+    return {flag.split()[0]: 2 if flag.endswith("image") else 1 for flag in flags}
+
+
+@pytest.fixture(scope="module")
+def narrow(device):
+    """Open a device with one lane: its programs are the quickest to build."""
+    return open_device(traits=replace(device.traits, lanes=1, block=8, slots=64))
+
+
+def bounce_arguments(opened):
+    """Return the names of all arguments of the launches of a bounce and of the film."""
+    launches = [*opened.bounce_launches, *(launch for launch, _ in opened.film_launches)]
+    return {name for launch in launches for name in launch.parameters}
+
+
+def test_no_flag_at_all_leaves_the_least(narrow):
+    scene, _ = with_flags()
+    narrow.programs.clear()
+    opened = renderer(narrow, scene)
+    assert not any(feature.value for feature in opened.plan.features.values())
+    assert set(opened.buffers) == ALWAYS
+    stages = [stage.name for stage in opened.plan.stages]
+    assert stages == ["camera", "intersect", "shade", "film"]
+    launched = [launch.name for launch in opened.bounce_launches]
+    assert launched == ["regenerate_paths", "intersect_closest", "shade_paths"]
+    left_out = dict(opened.plan.left_out)
+    assert left_out["connect"] == "the scene has no light"
+    assert left_out["textures"] == "no material has a texture"
+    assert left_out["lens"] == "the camera is a pinhole"
+    built = {program.file for program in narrow.programs.values()}
+    assert "connect.cl" not in built and "shade.cl" in built
+    opened.render(spp=2)
+    assert not opened.image().rgb.any()
+    opened.close()
+
+
+@pytest.mark.parametrize("flag", CHOICES)
+def test_each_flag_alone_brings_its_own_and_renders(narrow, flag):
+    scene, outputs = with_flags(flag)
+    narrow.programs.clear()
+    opened = renderer(narrow, scene, outputs)
+    on = {name: f.value for name, f in opened.plan.features.items() if f.value}
+    assert on == values_of([flag])
+    expected = ALWAYS | NEEDED.get(flag, set())
+    assert set(opened.buffers) == expected
+    assert bounce_arguments(opened) - {"film", "planes", "partial"} <= expected
+    for program in narrow.programs.values():
+        nonzero = {n: v for n, v in program.defines.items() if n in opened.plan.features and v}
+        assert nonzero.items() <= on.items()
+    has_light = flag in (*SKIES, *LIGHTS, "AREA_LIGHTS")
+    assert ("connect_lights" in [launch.name for launch in opened.bounce_launches]) == has_light
+    opened.render(spp=4)
+    image = opened.image()
+    assert np.isfinite(image.rgb).all()
+    assert image.rgb.any() == has_light
+    opened.close()
+
+
+def test_what_is_cut_out_whole_is_not_there(narrow):
+    # It lies between the camera, the floor and the light.
+    pictures = []
+    for flags in (("AREA_LIGHTS",), ("AREA_LIGHTS", "ALPHA")):
+        scene, _ = with_flags(*flags)
+        opened = renderer(narrow, scene)
+        opened.render(spp=16)
+        pictures.append(opened.image().rgb)
+        opened.close()
+    assert pictures[0].any()
+    np.testing.assert_allclose(pictures[0], pictures[1], rtol=1e-4)
+
+
+def test_every_flag_at_once_renders(narrow):
+    flags = [flag for flag in CHOICES if flag != "ENVIRONMENT"]
+    scene, _ = with_flags(*flags)
+    opened = renderer(narrow, scene, AOVS)
+    assert all(feature.value for feature in opened.plan.features.values())
+    assert opened.plan.left_out == ()
+    opened.render(spp=4)
+    image = opened.image()
+    assert set(image.aovs) == {"rgb", *AOVS}
+    assert all(np.isfinite(pixels).all() for pixels in image.aovs.values())
+    opened.close()
+
+
+def pairs():
+    """Return pairs of flags that are not two values of one."""
+    return [p for p in itertools.combinations(CHOICES, 2) if len(values_of(p)) == 2]
+
+
+def test_planned_bytes_are_those_that_are_allocated(narrow):
+    for flags in [(), *((flag,) for flag in CHOICES), tuple(CHOICES[:5]), tuple(CHOICES[5:])]:
+        scene, outputs = with_flags(*flags)
+        opened = renderer(narrow, scene, outputs)
+        planned = {buffer.name: buffer.bytes for buffer in opened.plan.buffers}
+        allocated = {name: buffer.bytes for name, buffer in opened.buffers.items()}
+        for estimate in ("nodes", "blocks"):
+            del planned[estimate], allocated[estimate]
+        assert planned == allocated, flags
+        opened.close()
+
+
+def test_estimates_of_the_hierarchy_are_of_the_right_size(narrow):
+    ball = primitives.sphere(64, 32)
+    scene = build([(ball, IDENTITY, lambertian(0.5))], camera((0, 0, 4), (0, 0, 0)))
+    opened = renderer(narrow, scene)
+    planned = {buffer.name: buffer.bytes for buffer in opened.plan.buffers}
+    for name in ("nodes", "blocks"):
+        assert 0.4 < planned[name] / opened.buffers[name].bytes < 2.5
+    opened.close()
+
+
+def test_plans_of_pairs_of_flags_hold_both_and_no_other(device):
+    for pair in pairs():
+        scene, outputs = with_flags(*pair)
+        plan = make_plan(scene, Settings(), outputs, device.traits)
+        assert {n: f.value for n, f in plan.features.items() if f.value} == values_of(pair)
+        expected = ALWAYS.union(*(NEEDED.get(flag, set()) for flag in pair))
+        assert {buffer.name for buffer in plan.buffers} == expected
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pair", pairs(), ids=" ".join)
+def test_pairs_of_flags_build(narrow, pair):
+    scene, outputs = with_flags(*pair)
+    plan = make_plan(scene, Settings(), outputs, narrow.traits)
+    for stage in plan.stages:
+        stack = {"STACK_SIZE": 16} if stage.traces else {}
+        load_program(narrow, stage.source, plan.defines(stage) | stack)
+
+
+def flags_read(text, names):
+    """Return those of ``names`` that preprocessor conditions and macros of ``text`` name."""
+    lines = [line for line in text.splitlines() if re.match(r"\s*#\s*(if|elif|define)", line)]
+    return {name for name in names if any(re.search(rf"\b{name}\b", line) for line in lines)}
+
+
+def test_stages_declare_the_flags_that_their_sources_read():
+    scene, outputs = with_flags(*(flag for flag in CHOICES if flag != "ENVIRONMENT"))
+    plan = make_plan(scene, Settings(), outputs)
+    for stage in plan.stages:
+        own = (kernel_folder() / stage.source).read_text(encoding="utf-8")
+        # An undeclared flag would be 0 whatever the scene needs.
+        assert flags_read(own, plan.features) <= set(stage.flags), stage.name
+        # One that nothing reads would build the same program anew.
+        text = re.sub(r"#ifndef \w+", "", assemble(stage.source))
+        assert set(stage.flags) <= flags_read(text, plan.features), stage.name
+
+
+def test_unused_materials_and_black_lights_bring_nothing():
+    scene, _ = with_flags("AREA_LIGHTS")
+    unused = Material(transmission=1.0, base_color_texture=0, emission=(1.0, 1.0, 1.0))
+    scene = replace(
+        scene,
+        materials=(*scene.materials, unused),
+        textures=(LEVELS,),
+        lights=(Light("point", (0.0, 0.0, 0.0)),),
+        environment=Environment((0.0, 0.0, 0.0), np.ones((2, 4, 3), np.float32)),
+    )
+    plan = make_plan(scene, Settings())
+    assert {n for n, f in plan.features.items() if f.value} == {"AREA_LIGHTS"}
+    assert ("materials", "1 are on no shape") in plan.left_out
+
+
+@pytest.mark.parametrize("crop", [(0, 0, 9, 8), (-1, 0, 4, 4), (0, 0, 0, 4), (7, 7, 2, 1)])
+def test_crop_outside_the_film_is_refused(crop):
+    with pytest.raises(InputError, match=r"--crop.*8x8"):
+        make_plan(with_flags()[0], Settings(), crop=crop)
+
+
+def test_unknown_output_is_refused_with_the_known_ones():
+    with pytest.raises(InputError, match=r"unknown beauty; known: albedo"):
+        make_plan(with_flags()[0], Settings(), ["beauty"])
