@@ -114,8 +114,12 @@ def eval_reflection(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
 
 
 def eval_diffuse(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
-    h = unit(wo + wi)
-    below = (1 - b.metallic) * (1 - b.transmission) * (1 - dielectric(b, dot(wo, h)))
+    """Kelemen, Szirmay-Kalos 2001: through the coat twice, over what the coat lets through at all."""
+    cosine = np.sqrt((np.arange(20000) + 0.5) / 20000)
+    average = schlick(b.f0, b.specular, cosine).mean()
+    enters = 1 - schlick(b.f0, b.specular, wo[..., 2])
+    leaves = 1 - schlick(b.f0, b.specular, wi[..., 2])
+    below = (1 - b.metallic) * (1 - b.transmission) * enters * leaves / (1 - average)
     value = below * np.maximum(wi[..., 2], 0) / np.pi
     return value[..., None] * np.array(b.base_color)
 

@@ -37,4 +37,4 @@ def lane_device(device: Device, request: pytest.FixtureRequest) -> Device:
     from psf_cl.traits import DeviceTraits
 
     kind, lanes = device.traits.kind, request.param
-    return Device(device.cl_device, DeviceTraits(kind, lanes, block=16, slots=1024, group=8))
+    return Device(device.context, DeviceTraits(kind, lanes, block=16, slots=1024, group=8))

@@ -4,7 +4,11 @@
 // wo points to the camera side, wi to the light side; `_local` is in the frame of the shading normal,
 // z along it, wo.z > 0.  eval_bsdf returns f times |cos wi|; pdfs are per solid angle.
 //
-// f = (1 - metallic) ((1 - transmission) (1 - F) base / pi  +  transmission btdf) + GGX(F_mixed)
+// f = (1 - metallic) ((1 - transmission) diffuse + transmission btdf) + GGX(F_mixed)
+// diffuse = base / pi (1 - F(cos o)) (1 - F(cos i)) / (1 - F_average): light enters through the coat and
+// leaves through it, so a white base under any coat gives back what it gets and never more (glTF's
+// 1 - F(o.h) gains up to four fifths at grazing angles).  Kelemen, Szirmay-Kalos: A Microfacet Based
+// Coupled Specular-Matte BRDF Model, 2001, with Schlick's reflectance for the coat's.
 // GGX: Walter et al. 2007; height-correlated masking: Heitz 2014; sampled by its bounded visible
 // normals: Dupuy and Benyoub 2023, Eto and Tokuyoshi 2023.  Single scattering: rough metals lose
 // energy (up to half at roughness 1).
@@ -63,7 +67,7 @@ inline Float dielectric_reflectance(Bsdf b, Float cosine)
 #endif
 }
 
-inline LobeChances lobe_chances(Bsdf b, Float cos_o)
+LARGE_FUNCTION LobeChances lobe_chances(Bsdf b, Float cos_o)
 {
     const Float f = dielectric_reflectance(b, cos_o);
     const Float color = max3(b.base_color);
@@ -164,7 +168,11 @@ LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Flo
     const Vec3 fresnel = lerp3(vec3_all(f), metal, b.metallic);
     const Float mirror = ggx_d(h, b.alpha) * ggx_visibility(wo.z, cos_i, b.alpha) * cos_i;
 
-    Float under = (1.0f - b.metallic) * (1.0f - f) * cos_i * INV_PI;
+    // Schlick's average over the hemisphere, weighted by the cosine, is f0 + (f90 - f0) / 21.
+    const Float enters = 1.0f - schlick(b.f0, b.specular, wo.z);
+    const Float leaves = 1.0f - schlick(b.f0, b.specular, cos_i);
+    const Float stays = 1.0f - (b.f0 + (b.specular - b.f0) * (1.0f / 21.0f));
+    Float under = (1.0f - b.metallic) * enters * leaves / max(stays, 1e-6f) * cos_i * INV_PI;
 #if TRANSMISSION
     under *= 1.0f - b.transmission;
 #endif
@@ -203,7 +211,7 @@ LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Flo
 }
 
 /// Draw wi (local); the caller evaluates it.  Returns z = 0 where the draw failed.
-inline Vec3 sample_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Float u_lobe, Float u1, Float u2)
+LARGE_FUNCTION Vec3 sample_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Float u_lobe, Float u1, Float u2)
 {
     // Cosine-weighted: Malley's method.
     const Float radius = sqrt(u1);

@@ -63,7 +63,7 @@ inline Float environment_density(
 }
 
 /// Bilinear radiance at (u, v).
-inline Vec3 environment_look_up(
+LARGE_FUNCTION Vec3 environment_look_up(
     __global const Params *params, __global const EnvironmentCell *cells, Float u, Float v)
 {
     const Float x = u * (float)params->environment_width - 0.5f;
@@ -86,7 +86,7 @@ inline Vec3 environment_look_up(
 
 #if ENVIRONMENT
 /// Radiance from direction `d`, and the density with which sample_light draws it.
-inline Vec3 eval_environment(
+LARGE_FUNCTION Vec3 eval_environment(
     __global const Params *params,
 #if ENVIRONMENT == 2
     __global const EnvironmentCell *cells,
@@ -124,7 +124,7 @@ inline Float area_light_density(
 /// Draw a light, then a direction to it, from point `p` whose ray origin is `origin`.
 ///
 /// pdf is 0 where nothing arrives.  `seed`, `sample` and `pair` (the vertex's first) name the numbers.
-inline LightSample sample_light(
+LARGE_FUNCTION LightSample sample_light(
     __global const Params *params,
     __global const Light *lights,
     __global const Surface *surfaces,

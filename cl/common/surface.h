@@ -40,7 +40,7 @@ typedef struct {
 #define OFFSET_EPSILON 9.5367432e-7f
 
 /// Set up the point that barycentrics (u, v) of `triangle` name, seen along wo.
-inline SurfacePoint surface_point(
+LARGE_FUNCTION SurfacePoint surface_point(
     UInt triangle,
     Float u,
     Float v,

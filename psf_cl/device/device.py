@@ -42,7 +42,7 @@ class Buffer:
 
 
 class Device:
-    """A context and an in-order queue on one OpenCL device.
+    """An in-order queue on the one device of a context.
 
     Nothing here is global: several of them live side by side.
 
@@ -52,11 +52,11 @@ class Device:
         totals: launches, seconds and items of each kernel (profiling only).
     """
 
-    def __init__(self, device: cl.Device, traits: DeviceTraits, profiling: bool = False) -> None:
-        self.cl_device = device
+    def __init__(self, context: cl.Context, traits: DeviceTraits, profiling: bool = False) -> None:
+        self.context = context
+        self.cl_device = context.devices[0]
         self.traits = traits
         self.profiling = profiling
-        self.context = cl.Context([device])
         flags = cl.command_queue_properties.PROFILING_ENABLE if profiling else 0
         self.queue = cl.CommandQueue(self.context, properties=flags)
         self.allocated_bytes = 0
@@ -230,10 +230,14 @@ def open_device(
     devices.sort(key=lambda device: rank.get(device.type, 2))
     failures = []
     for device in devices:
-        reason = run_self_test(device)
+        try:
+            context = cl.Context([device])
+            reason = run_self_test(device, context)
+        except cl.Error as error:
+            reason = str(error)
         if reason is None:
             kind = "cpu" if device.type & cl.device_type.CPU else "gpu"
-            return Device(device, traits or DeviceTraits.of_kind(kind), profiling)
+            return Device(context, traits or DeviceTraits.of_kind(kind), profiling)
         failures.append(f"{device.platform.name}: {reason}")
     raise DeviceError(
         "no OpenCL device passes the self-test"

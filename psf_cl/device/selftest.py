@@ -84,8 +84,13 @@ class DeviceReport:
     seconds: float
 
 
-def run_self_test(device: cl.Device) -> str | None:
-    """Run the kernel on ``device`` in this process; return one line on what is wrong, else None."""
+def run_self_test(device: cl.Device, context: cl.Context | None = None) -> str | None:
+    """Run the kernel on ``device`` in this process; return one line on what is wrong, else None.
+
+    Args:
+        context: to run in, if it is to be used afterwards: PoCL takes most of a second to get ready
+            for the first program that it compiles in a context.
+    """
     import pyopencl as cl
 
     count = 1000
@@ -96,7 +101,7 @@ def run_self_test(device: cl.Device) -> str | None:
     histogram = np.zeros(_BINS, np.uint32)
     group_sums = np.empty(group_count, np.uint32)
     try:
-        context = cl.Context([device])
+        context = context or cl.Context([device])
         queue = cl.CommandQueue(context)
         flags = cl.mem_flags
         x_buffer = cl.Buffer(context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=x)
