@@ -78,9 +78,7 @@ class Renderer:
         if self.bvh.stack_size != MIN_STACK_SIZE:
             programs = self._compile(self.bvh.stack_size)
         self._bind(programs)
-        self.scheduler = Scheduler(
-            Frame(self._bounce, self._film, self._counters, self._limit), self.plan.pixel_count
-        )
+        self.scheduler = Scheduler(Frame(self._bounce, self._film, self._counters, self._limit))
         self.load_seconds = load_end - start
         self.build_seconds = build_end - load_end
 
@@ -208,18 +206,8 @@ class Renderer:
 
     def stats(self) -> dict[str, Any]:
         """Return what ``--stats`` writes, without errors against a reference."""
-        counters = self.device.read(self.buffers["counters"])
-
-        def wide(name: str) -> int:
-            at = layout.COUNTER_INDEX[name]
-            return int(counters[at]) + (int(counters[at + 1]) << 32)
-
-        names = ("camera", "bounce", "shadow")
-        # Rays since the last film launch have not been carried over yet.
-        rays = {
-            name: wide(f"{name}_rays") + int(counters[layout.COUNTER_INDEX[f"pending_{name}"]])
-            for name in names
-        }
+        counters = self.device.read(self.buffers["counters"], layout.COUNTER_INDEX["finished"])
+        rays = {kind: layout.rays_so_far(counters, kind) for kind in ("camera", "bounce", "shadow")}
         stages = [
             {"name": name, "launches": launches, "seconds": seconds, "items": items}
             for name, (launches, seconds, items) in self.device.totals.items()

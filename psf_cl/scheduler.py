@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from psf_cl.device.layout import COUNTER_INDEX
+from psf_cl.device.layout import COUNTER_INDEX, rays_so_far
 
 if TYPE_CHECKING:
     import numpy as np
@@ -75,9 +75,8 @@ class Scheduler:
         clock: seconds spent in ``run``.
     """
 
-    def __init__(self, frame: Frame, pixel_count: int) -> None:
+    def __init__(self, frame: Frame) -> None:
         self.frame = frame
-        self.pixel_count = pixel_count
         self.passes = 0
         self.clock = Clock()
         self.bounces = BOUNCES_PER_FILM
@@ -98,7 +97,8 @@ class Scheduler:
         Returns:
             Whether it came to its end, that is, was not stopped.
         """
-        first_passes, first_seconds = self.passes, self.clock.now()
+        first_samples = rays_so_far(self.frame.counters(), "camera")
+        first_seconds = self.clock.now()
         limit = spp
         self.frame.limit(limit if limit is not None else 0xFFFFFFFF)
         self.clock.start()
@@ -109,12 +109,13 @@ class Scheduler:
                     self.frame.bounce()
                     if (bounce + 1) % BOUNCES_PER_FILM == 0:
                         self.frame.film()
-                self.passes = int(self.frame.counters()[COUNTER_INDEX["film_pass"]])
+                counters = self.frame.counters()
+                self.passes = int(counters[COUNTER_INDEX["film_pass"]])
                 self._adapt(time.perf_counter() - begin)
                 now = self.clock.now()
                 if progress is not None:
-                    done = (self.passes - first_passes) * self.pixel_count
-                    rate = done / max(now - first_seconds, 1e-9)
+                    samples = rays_so_far(counters, "camera") - first_samples
+                    rate = samples / max(now - first_seconds, 1e-9)
                     if progress(Progress(self.passes, spp, now, seconds, rate)) is False:
                         return False
                 if seconds is not None and limit is None and now >= seconds:

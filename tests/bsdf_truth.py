@@ -114,7 +114,7 @@ def eval_reflection(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
 
 
 def eval_diffuse(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
-    """Kelemen, Szirmay-Kalos 2001: through the coat twice, over what the coat lets through at all."""
+    """Kelemen, Szirmay-Kalos 2001: twice through the coat, over what it lets through at all."""
     cosine = np.sqrt((np.arange(20000) + 0.5) / 20000)
     average = schlick(b.f0, b.specular, cosine).mean()
     enters = 1 - schlick(b.f0, b.specular, wo[..., 2])

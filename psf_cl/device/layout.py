@@ -362,3 +362,11 @@ def header() -> str:
 
 COUNTER_INDEX = {name: index for index, (name, _) in enumerate(COUNTERS)}
 CONSTANT = {name: value for name, value, _ in CONSTANTS}
+
+
+def rays_so_far(counters: np.ndarray, kind: str) -> int:
+    """Return the rays of ``kind`` (camera, bounce, shadow) that ``counters`` tell of."""
+    at = COUNTER_INDEX[f"{kind}_rays"]
+    # Those since the last film launch have not been carried over into the two words yet.
+    pending = int(counters[COUNTER_INDEX[f"pending_{kind}"]])
+    return int(counters[at]) + (int(counters[at + 1]) << 32) + pending
