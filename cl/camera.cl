@@ -6,13 +6,26 @@
 #include "common/pool.h"
 #include "common/rng.h"
 
+/// Exponent bits of the largest of three numbers; tested on bits, for a compiler may assume that no
+/// float is NaN.
+inline UInt exponent_bits(Vec3 v)
+{
+    return max(as_bits(v.x) & 0x7f800000u, max(as_bits(v.y) & 0x7f800000u, as_bits(v.z) & 0x7f800000u));
+}
+
+// From 2^96 on, a film's sums could overflow.
+#define MAX_EXPONENT_BITS 0x6f800000u
+
 /// Hand in finished paths, give free slots the next (pixel, sample), start those whose pass may start.
 ///
 /// A slot that took a sample of a pass that may not start yet keeps it and waits, so every sample is
 /// started exactly once.  Which slot gets which sample does not show in the image.
 ///
+/// A sample that is not finite, or too large to be summed, is handed in as black and counted.
+///
 /// reads   pool, counters, pixel_order
-/// writes  pool; samples (and direct) of finished paths; counters.next_pixel, finished[], rays
+/// writes  pool; samples (and direct) of finished paths; counters.{next_pixel, finished[],
+///         rejected_samples, pending_camera}
 kernel void regenerate_paths(
     __global const Params *params,
     __global const uint *pixel_order,
@@ -35,6 +48,18 @@ kernel void regenerate_paths(
 
     const Mask done = (status & STATUS_MASK) == STATUS_DONE;
     if (any_lane(done)) {
+        Vec3 radiance = get_v(path, PATH_RADIANCE_R);
+        UInt exponent = exponent_bits(radiance);
+#if AOV_DIRECT
+        Vec3 direct_part = get_v(path, PATH_DIRECT_R);
+        exponent = max(exponent, exponent_bits(direct_part));
+#endif
+        const Mask bad = done & (exponent >= MAX_EXPONENT_BITS);
+        const Vec3 black = vec3_all((Float)(0.0f));
+        radiance = pick_v(bad, black, radiance);
+        if (any_lane(bad))
+            atomic_add(&counters[COUNTER_REJECTED_SAMPLES], count_lanes(bad));
+
         uint lane_status[W];
         uint lane_sample[W];
         uint lane_pixel[W];
@@ -42,12 +67,15 @@ kernel void regenerate_paths(
         store_lanes_u(status, lane_status);
         store_lanes_u(sample, lane_sample);
         store_lanes_u(pixel, lane_pixel);
-        for (uint c = 0; c < 3; ++c)
-            store_lanes(FIELD(path, PATH_RADIANCE_R + c), lane_value[c]);
+        store_lanes(radiance.x, lane_value[0]);
+        store_lanes(radiance.y, lane_value[1]);
+        store_lanes(radiance.z, lane_value[2]);
 #if AOV_DIRECT
+        direct_part = pick_v(bad, black, direct_part);
         float lane_direct[3][W];
-        for (uint c = 0; c < 3; ++c)
-            store_lanes(FIELD(path, PATH_DIRECT_R + c), lane_direct[c]);
+        store_lanes(direct_part.x, lane_direct[0]);
+        store_lanes(direct_part.y, lane_direct[1]);
+        store_lanes(direct_part.z, lane_direct[2]);
 #endif
         // Neighbours mostly belong to one pass: one atomic for a run of them.
         uint run = 0;

@@ -25,23 +25,24 @@ kernel void connect_lights(
         return;
     __global Float *path = pool_at(pool, item);
     const Vec3 light = get_v(path, PATH_LIGHT_R);
-    const Mask wanted = max3(light) > 0.0f;
+    // Not a number must not vanish here: it goes on into the sample, which is rejected and counted.
+    const Mask wanted = !(light.x + light.y + light.z <= 0.0f);
     if (!any_lane(wanted))
         return;
     atomic_add(&counters[COUNTER_PENDING_SHADOW], count_lanes(wanted));
 
     float origin[3][W];
     float toward[3][W];
-    float lane_light[3][W];
+    float lane_wanted[W];
     for (uint c = 0; c < 3; ++c) {
         store_lanes(FIELD(path, PATH_SHADOW_X + c), origin[c]);
         store_lanes(FIELD(path, PATH_TOWARD_X + c), toward[c]);
-        store_lanes(FIELD(path, PATH_LIGHT_R + c), lane_light[c]);
     }
+    store_lanes(pick(wanted, (Float)(1.0f), (Float)(0.0f)), lane_wanted);
     float seen[W];
     for (uint k = 0; k < W; ++k) {
         seen[k] = 0.0f;
-        if (!(max(lane_light[0][k], max(lane_light[1][k], lane_light[2][k])) > 0.0f))
+        if (lane_wanted[k] == 0.0f)
             continue;
         Ray ray;
         for (uint c = 0; c < 3; ++c) {

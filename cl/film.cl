@@ -19,22 +19,10 @@ inline void add_compensated(__global FilmSum *sum, uint c, float value)
     sum->sum[c] = t;
 }
 
-inline void add_sample(__global FilmSum *sum, volatile __global uint *counters, float4 sample)
+inline void add_sample(__global FilmSum *sum, float4 sample)
 {
     if (sample.w <= 0.0f)
         return;
-    // On bits: a compiler may assume that no float is NaN.  From 2^96 on, sums could overflow.
-    uint bad = 0;
-    const uint4 exponents = as_uint4(sample) & 0x7f800000u;
-    bad |= exponents.x >= 0x6f800000u;
-    bad |= exponents.y >= 0x6f800000u;
-    bad |= exponents.z >= 0x6f800000u;
-    if (bad) {
-        atomic_inc(&counters[COUNTER_REJECTED_SAMPLES]);
-        sample.x = 0.0f;
-        sample.y = 0.0f;
-        sample.z = 0.0f;
-    }
     sum->count += 1u;
     add_compensated(sum, 0, sample.x);
     add_compensated(sum, 1, sample.y);
@@ -52,11 +40,11 @@ inline void add_sample(__global FilmSum *sum, volatile __global uint *counters, 
 /// With `partial` set, the samples of the first pass that are there (an interrupted first pass).
 ///
 /// reads   samples, counters
-/// writes  film; counters.rejected_samples
+/// writes  film
 kernel void add_samples(
     __global const Params *params,
     __global const float *samples,
-    volatile __global uint *counters,
+    const volatile __global uint *counters,
     __global FilmSum *film,
     const uint planes,
     const uint partial)
@@ -71,7 +59,7 @@ kernel void add_samples(
             break;
         const ulong pass = (counters[COUNTER_FILM_PASS] + k) & (params->ring - 1u);
         const ulong at = ((ulong)plane * params->ring + pass) * params->pixel_count + pixel;
-        add_sample(&film[i], counters, vload4(at, samples));
+        add_sample(&film[i], vload4(at, samples));
         if (partial)
             break;
     }

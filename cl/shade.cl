@@ -5,11 +5,11 @@
 #include "common/layout.h"
 #include "common/pool.h"
 #include "common/rng.h"
+#include "common/alpha.h"
 #include "common/surface.h"
 #include "common/bsdf.h"
 #include "common/light.h"
 
-#define ANY_LIGHT (AREA_LIGHTS || PUNCTUAL_LIGHTS || ENVIRONMENT)
 #define MAX_SURVIVAL 0.95f
 
 /// Weight of emission that a BSDF-sampled ray found, against sampling the light.
@@ -69,7 +69,7 @@ inline void store_features(
 /// Shade what the rays hit, prepare a shadow ray, and send the paths on or end them.
 ///
 /// reads   pool, scene tables
-/// writes  pool.{status, origin, direction, beta, radiance, pdf, shadow, toward, light}; features
+/// writes  pool.{status, origin, direction, beta, radiance, direct, pdf, shadow, toward, light}; features
 kernel void shade_paths(
     __global const Params *params,
     __global const Surface *surfaces,
@@ -83,7 +83,7 @@ kernel void shade_paths(
     __global const uchar4 *texels,
     __global const float *srgb_to_linear,
 #endif
-#if ANY_LIGHT
+#if CONNECT
     __global const Light *lights,
 #endif
 #if ENVIRONMENT == 2
@@ -142,15 +142,19 @@ kernel void shade_paths(
     const Mask emits =
         hit & (s.light != NO_LIGHT) & (s.front | ((flags & MATERIAL_TWO_SIDED_EMISSION) != 0u));
     if (any_lane(emits)) {
-        const UInt light = pick_u(emits, s.light, (UInt)(0u));
         Vec3 emission = vec3(GATHER(materials, s.material, emission[0]), GATHER(materials, s.material, emission[1]),
                              GATHER(materials, s.material, emission[2]));
 #if TEXTURES
         emission = textured(emits, emission, GATHER_U(materials, s.material, emission_texture), triangle, u, v,
                             uvs, textures, texels, srgb_to_linear);
 #endif
+#if CONNECT
+        const UInt light = pick_u(emits, s.light, (UInt)(0u));
         const Float pdf_light =
-            area_light_density(lights, light, FIELD(path, PATH_HIT_T), fabs(dot3(s.ng, wo)), s.area);
+            area_light_density(lights, light, FIELD(path, PATH_HIT_T), fabs(dot3(s.ng, wo)));
+#else
+        const Float pdf_light = (Float)(0.0f);
+#endif
         const Float weight = emission_weight(params, camera_ray, pdf_bsdf, pdf_light);
         emitted = pick_v(emits, scale(emission, weight), emitted);
     }
@@ -211,7 +215,7 @@ kernel void shade_paths(
     Float u_alias;
     sample_pair(seed, sample, pair + PAIR_ROULETTE, params->sampler, &u_roulette, &u_alias);
 
-#if ANY_LIGHT
+#if CONNECT
     if (params->light_count > 0u) {
         const Float away = s.offset;
         const Vec3 above = add_scaled(s.p, s.ng, away);
@@ -251,7 +255,11 @@ kernel void shade_paths(
     Float pdf;
     const Vec3 f = eval_bsdf(b, chances, wo_local, drawn, dot3(s.ng, wi), &pdf);
     beta = mul(beta, scale(f, 1.0f / pick(pdf > 0.0f, pdf, (Float)(1.0f))));
-    Mask survives = goes_on & (pdf > 0.0f) & (max3(beta) > 0.0f);
+    const Float carried = beta.x + beta.y + beta.z;
+    const Mask broken = goes_on & !(carried < INFINITY);
+    // The film rejects and counts the sample.
+    FIELD(path, PATH_RADIANCE_R) = pick(broken, (Float)(NAN), FIELD(path, PATH_RADIANCE_R));
+    Mask survives = goes_on & (pdf > 0.0f) & (carried > 0.0f) & !broken;
 
     const Mask roulette = (depth + 1u) > params->roulette_depth;
     const Float chance = pick(roulette, min(max3(beta), (Float)(MAX_SURVIVAL)), (Float)(1.0f));

@@ -18,17 +18,7 @@ import PIL.Image
 import psf_cl
 from psf_cl.errors import InputError
 from psf_cl.files import read_file, write_whole
-
-# What can be asked for beside "rgb".
-AOVS = {
-    "albedo": "reflectance of the first surface seen",
-    "normal": "shading normal there, world space",
-    "depth": "distance to it from the camera, meters",
-    "direct": "light reflected there once, or emitted there",
-    "indirect": "all other light: rgb = direct + indirect",
-    "variance": "of the pixel's mean, estimated from its samples",
-    "samples": "samples of the pixel",
-}
+from psf_cl.settings import AOVS as AOVS
 
 # Channel letters in the file, where they are not those that the number of components implies.
 _LETTERS = {"normal": "XYZ", "depth": "Z"}

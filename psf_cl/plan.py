@@ -10,15 +10,13 @@ import numpy as np
 
 from psf_cl.device import layout
 from psf_cl.errors import InputError
-from psf_cl.scene.model import Scene
+from psf_cl.image import AOVS
+from psf_cl.scene.model import Scene, emits, has_environment, is_cut_out, shines
 from psf_cl.settings import Settings
 from psf_cl.stages import camera, connect, film, intersect, shade
 from psf_cl.stages.spec import BufferSpec, Context, Feature, StageSpec
-from psf_cl.tables import emits, has_environment, is_cut_out
+from psf_cl.tables import visible_shapes
 from psf_cl.traits import DeviceTraits
-
-#: Names that ``outputs`` may hold besides the image itself.
-AOVS = ("albedo", "normal", "depth", "direct", "indirect", "variance", "samples")
 
 #: Bytes that the passes in flight may take before the ring is made shorter.
 RING_BYTES = 1 << 28
@@ -101,6 +99,7 @@ def make_plan(
     outputs: Iterable[str] = (),
     traits: DeviceTraits | None = None,
     crop: tuple[int, int, int, int] | None = None,
+    statistics: bool = False,
 ) -> Plan:
     """Derive what a render needs; works without OpenCL.
 
@@ -108,6 +107,7 @@ def make_plan(
         outputs: AOVs to deliver besides the image.
         traits: of the device; a CPU if not given.
         crop: (x, y, width, height) in pixels; the whole film if not given.
+        statistics: whether the paths of the pool are to be counted by depth.
 
     Raises:
         InputError: an unknown AOV, or a crop outside the film.
@@ -132,17 +132,17 @@ def make_plan(
             f"{scene.width}x{scene.height}"
         )
 
-    features = _features(scene, outputs)
+    features = _features(scene, settings, outputs)
     pixel_count = width * height
-    used = {shape.material for shape in scene.shapes}
-    triangles = sum(len(shape.mesh.triangles) for shape in scene.shapes)
+    shapes = visible_shapes(scene)
+    triangles = sum(len(shape.mesh.triangles) for shape in shapes)
     image = scene.environment.image
     context = Context(
         features,
         traits,
         pixel_count,
         _ring(pixel_count, traits, features),
-        outputs=outputs,
+        statistics=statistics,
         triangle_count=triangles,
         material_count=len(scene.materials),
         texture_count=len(scene.textures),
@@ -151,23 +151,21 @@ def make_plan(
         if image is not None and features["ENVIRONMENT"].value == 2
         else 0,
     )
-    stages, left_out = [], []
+    stages = []
     for module in (camera, intersect, shade, connect, film):
         stage = module.plan(context)
-        if stage is None:
-            left_out.append((module.__name__.rsplit(".", 1)[-1], "the scene has no light"))
-        else:
+        if stage is not None:
             stages.append(stage)
-    left_out += [
+    left_out = [
         (name.lower(), feature.reason) for name, feature in features.items() if not feature.value
     ]
-    if len(used) < len(scene.materials):
-        left_out.append(("materials", f"{len(scene.materials) - len(used)} are on no shape"))
+    if len(shapes) < len(scene.shapes):
+        left_out.append(("shapes", f"{len(scene.shapes) - len(shapes)} are cut out whole"))
     return Plan(
         features,
         tuple(stages),
         tuple(left_out),
-        _scene_buffers(context, scene, used),
+        _scene_buffers(context, scene),
         outputs,
         crop,
         context.ring,
@@ -190,10 +188,11 @@ def _ring(pixel_count: int, traits: DeviceTraits, features: dict[str, Feature]) 
     return ring
 
 
-def _features(scene: Scene, outputs: frozenset[str]) -> dict[str, Feature]:
-    materials = [scene.materials[i] for i in sorted({shape.material for shape in scene.shapes})]
+def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict[str, Feature]:
+    shapes = visible_shapes(scene)
+    materials = [scene.materials[i] for i in sorted({shape.material for shape in shapes})]
     camera_lens = bool(scene.cameras) and scene.cameras[scene.camera].lens_radius > 0.0
-    lights = [light for light in scene.lights if max(light.intensity) > 0.0]
+    lights = [light for light in scene.lights if shines(light)]
     sky = has_environment(scene.environment)
     image = scene.environment.image is not None
 
@@ -212,7 +211,7 @@ def _features(scene: Scene, outputs: frozenset[str]) -> dict[str, Feature]:
             "no material is cut out",
         ),
         "SMOOTH": switch(
-            any(shape.mesh.normals is not None for shape in scene.shapes),
+            any(shape.mesh.normals is not None for shape in shapes),
             "a mesh has shading normals",
             "no mesh has shading normals",
         ),
@@ -233,6 +232,7 @@ def _features(scene: Scene, outputs: frozenset[str]) -> dict[str, Feature]:
             if sky
             else "the environment is black",
         ),
+        "CONNECT": _connect(settings, any(emits(m) for m in materials) or sky, bool(lights)),
         "LENS": switch(camera_lens, "the camera has a lens", "the camera is a pinhole"),
         "AOV_DIRECT": switch(
             bool(outputs & {"direct", "indirect"}),
@@ -247,14 +247,25 @@ def _features(scene: Scene, outputs: frozenset[str]) -> dict[str, Feature]:
     }
 
 
-def _scene_buffers(context: Context, scene: Scene, used: set[int]) -> tuple[BufferSpec, ...]:
+def _connect(settings: Settings, extended: bool, punctual: bool) -> Feature:
+    """Return whether lights are sampled, and why."""
+    if not (extended or punctual):
+        return Feature(0, "the scene has no light")
+    if settings.max_depth == 0:
+        return Feature(0, "max_depth is 0: nothing is lit, only seen")
+    if settings.direct_sampling == "bsdf" and not punctual:
+        return Feature(0, "direct_sampling is bsdf, and every light has an extent")
+    return Feature(1, "lights are sampled at every vertex")
+
+
+def _scene_buffers(context: Context, scene: Scene) -> tuple[BufferSpec, ...]:
     triangles = context.triangle_count
     emitting = sum(
         len(shape.mesh.triangles)
         for shape in scene.shapes
         if emits(scene.materials[shape.material])
     )
-    punctual = sum(max(light.intensity) > 0.0 for light in scene.lights)
+    punctual = sum(shines(light) for light in scene.lights)
     lights = emitting + punctual + bool(context.features["ENVIRONMENT"].value)
     float32, uint8 = np.dtype(np.float32), np.dtype(np.uint8)
     buffers = [
@@ -266,7 +277,7 @@ def _scene_buffers(context: Context, scene: Scene, used: set[int]) -> tuple[Buff
     ]
     if context.on("SMOOTH"):
         buffers.append(BufferSpec("normals", layout.NORMALS.dtype, triangles, "shading normals"))
-    if context.on("TEXTURES") or context.on("ALPHA"):
+    if context.on("TEXTURES"):
         buffers += [
             BufferSpec("uvs", layout.UVS.dtype, triangles, "texture coordinates"),
             BufferSpec(
@@ -275,7 +286,7 @@ def _scene_buffers(context: Context, scene: Scene, used: set[int]) -> tuple[Buff
             BufferSpec("texels", uint8, 4 * max(context.texel_count, 1), "texels of all textures"),
             BufferSpec("srgb_to_linear", float32, 256, "decoding table"),
         ]
-    if lights:
+    if context.on("CONNECT"):
         buffers.append(BufferSpec("lights", layout.LIGHT.dtype, lights, "light table"))
     if context.features["ENVIRONMENT"].value == 2:
         buffers.append(

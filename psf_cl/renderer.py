@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -13,20 +14,17 @@ import numpy as np
 
 from psf_cl import tables
 from psf_cl.device import layout
-from psf_cl.device.bvh import MIN_STACK_SIZE, Bvh, build_bvh
+from psf_cl.device.bvh import MIN_STACK_SIZE, Bvh, build_bvh, warm_up_builder
 from psf_cl.device.device import Buffer, Device, open_device
 from psf_cl.device.program import Launch, Program, load_program
-from psf_cl.errors import InputError
+from psf_cl.errors import DeviceError, InputError
 from psf_cl.image import Image
 from psf_cl.plan import Plan, make_plan
 from psf_cl.scene.load import load_scene
-from psf_cl.scene.model import Scene
-from psf_cl.scheduler import Frame, Progress, Scheduler
+from psf_cl.scene.model import Scene, is_cut_out
+from psf_cl.scheduler import Hooks, Progress, Scheduler
 from psf_cl.settings import Settings, resolve
 from psf_cl.stages import film
-
-#: Depths that the occupancy statistics tell apart; the last takes all beyond.
-OCCUPANCY_BINS = 32
 
 
 class Renderer:
@@ -51,26 +49,42 @@ class Renderer:
         crop: tuple[int, int, int, int] | None = None,
         statistics: bool = False,
     ) -> None:
-        start = time.perf_counter()
         self.scene = scene
         self.settings = settings or resolve(scene.render, scene.path)
         if not scene.cameras:
             raise InputError(f"{scene.path}: no camera")
         self.device = device or open_device(profiling=statistics)
-        self.plan: Plan = make_plan(scene, self.settings, outputs, self.device.traits, crop)
+        self.plan: Plan = make_plan(
+            scene, self.settings, outputs, self.device.traits, crop, statistics
+        )
         self.compile_seconds = 0.0
         self.statistics = statistics
         self.censuses = 0
-        self.depth_counts = np.zeros(OCCUPANCY_BINS)
+        self.depth_counts = np.zeros(film.CENSUS_BINS)
         self.buffers: dict[str, Buffer] = {}
+        try:
+            self._set_up()
+        except BaseException:
+            self.close()
+            raise
+        self.scheduler = Scheduler(
+            Hooks(self._bounce, self._film, self._counters, self._limit), self.plan.traits.slots
+        )
+
+    def _set_up(self) -> None:
+        """Load and build while a second thread compiles."""
         background = ThreadPoolExecutor(1)
         try:
             compiling = background.submit(self._compile, MIN_STACK_SIZE)
+            start = time.perf_counter()
+            self._check_memory()
             self._allocate()
             geometry = self._upload_scene()
-            load_end = time.perf_counter()
+            self.load_seconds = time.perf_counter() - start
+            self.compile_seconds += warm_up_builder(self.device)
+            start = time.perf_counter()
             self.bvh: Bvh = self._build_bvh(geometry)
-            build_end = time.perf_counter()
+            self.build_seconds = time.perf_counter() - start
             programs = compiling.result()
         finally:
             # An error or Ctrl-C is told now, not when the compiler has come to its end.
@@ -78,9 +92,6 @@ class Renderer:
         if self.bvh.stack_size != MIN_STACK_SIZE:
             programs = self._compile(self.bvh.stack_size)
         self._bind(programs)
-        self.scheduler = Scheduler(Frame(self._bounce, self._film, self._counters, self._limit))
-        self.load_seconds = load_end - start
-        self.build_seconds = build_end - load_end
 
     # What happens each bounce, in its order.
 
@@ -124,9 +135,11 @@ class Renderer:
 
         Returns:
             False if ``progress`` stopped it by returning False.
+
+        Raises:
+            InputError: not exactly one of them, or a number that makes no sense.
         """
-        if (spp is None) == (seconds is None):
-            raise InputError("give either spp or seconds")
+        check_budget(spp, seconds)
         return self.scheduler.run(spp, seconds, progress)
 
     @contextlib.contextmanager
@@ -153,7 +166,7 @@ class Renderer:
     def _image(self, names: set[str]) -> Image:
         x, y, width, height = self.plan.crop
         partial = self.scheduler.passes == 0
-        order = self._order()
+        order = self.order
         sums: dict[str, np.ndarray] = {}
         for ring, name, planes in film.PLANES:
             if name not in self.buffers:
@@ -249,17 +262,23 @@ class Renderer:
 
     # Set-up.
 
+    def _check_memory(self) -> None:
+        needed, there = self.plan.total_bytes, self.device.memory_bytes
+        if needed > there:
+            raise DeviceError(
+                f"the render needs {needed / 2**20:.0f} MiB, {self.device.name} has "
+                f"{there / 2**20:.0f}; a smaller --size or --crop, or fewer AOVs, need less"
+            )
+
     def _allocate(self) -> None:
         for stage in self.plan.stages:
             for spec in stage.buffers:
                 self.buffers[spec.name] = self.device.allocate(spec.name, spec.dtype, spec.count)
-        self.device.write(self.buffers["pixel_order"], tables.pixel_order(*self.plan.crop))
-
-    def _order(self) -> np.ndarray:
-        """Return the place in the crop of each entry of the pixel order."""
         x, y, width, _ = self.plan.crop
         order = tables.pixel_order(*self.plan.crop)
-        return ((order >> 16) - y) * width + ((order & 0xFFFF) - x)
+        self.device.write(self.buffers["pixel_order"], order)
+        # Where each entry of the order lies in the crop.
+        self.order = ((order >> 16) - y) * width + ((order & 0xFFFF) - x)
 
     def _upload_scene(self) -> tables.Geometry:
         scene, planned = self.scene, {spec.name for spec in self.plan.scene_buffers}
@@ -290,7 +309,6 @@ class Renderer:
         self, geometry: tables.Geometry, light_count: int, environment_pmf: float
     ) -> np.ndarray:
         scene, settings = self.scene, self.settings
-        x, y, width, _ = self.plan.crop
         params = np.zeros(1, layout.PARAMS.dtype)
         values: dict[str, Any] = tables.camera_values(
             scene.cameras[scene.camera], scene.width, scene.height
@@ -299,9 +317,6 @@ class Renderer:
         values |= {
             "width": scene.width,
             "height": scene.height,
-            "crop_x": x,
-            "crop_y": y,
-            "crop_width": width,
             "pixel_count": self.plan.pixel_count,
             "ring": self.plan.ring,
             "slots": self.plan.traits.slots,
@@ -311,14 +326,12 @@ class Renderer:
             if settings.termination == "roulette"
             else 0xFFFFFFFF,
             "light_count": light_count,
-            "triangle_count": geometry.count,
-            "material_count": len(scene.materials),
             "environment_width": 1 if image is None else image.shape[1],
             "environment_height": 1 if image is None else image.shape[0],
             "environment_radiance": scene.environment.radiance,
             "environment_pmf": environment_pmf,
             "environment_rotation": np.asarray(scene.environment.rotation).T.reshape(9),
-            "scene_radius": self._scene_radius(geometry),
+            "scene_radius": max(geometry.radius, float(np.finfo(np.float32).tiny)),
             "direct_sampling": layout.CONSTANT[f"DIRECT_{settings.direct_sampling.upper()}"],
             "sampler": layout.CONSTANT[f"SAMPLER_{settings.sampler.upper()}"],
         }
@@ -326,19 +339,16 @@ class Renderer:
             params[0][name] = value
         return params
 
-    def _scene_radius(self, geometry: tables.Geometry) -> float:
-        """Return the radius of a sphere around the geometry."""
-        return max(geometry.radius, float(np.finfo(np.float32).tiny))
-
     def _build_bvh(self, geometry: tables.Geometry) -> Bvh:
         device = self.device
-        positions = device.upload("positions", geometry.positions.reshape(-1))
-        flags = None
-        if self.plan.features["ALPHA"].value:
-            cut_out = np.array([tables.is_cut_out(m) for m in self.scene.materials], np.uint32)
-            flags = device.upload("alpha_flags", cut_out[geometry.surfaces["material"]])
-        bvh = build_bvh(device, positions, geometry.count, flags)
-        device.release(positions, *([flags] if flags is not None else []))
+        inputs = [device.upload("positions", geometry.positions.reshape(-1))]
+        try:
+            if self.plan.features["ALPHA"].value:
+                cut_out = np.array([is_cut_out(m) for m in self.scene.materials], np.uint32)
+                inputs.append(device.upload("alpha_flags", cut_out[geometry.surfaces["material"]]))
+            bvh = build_bvh(device, inputs[0], geometry.count, *inputs[1:])
+        finally:
+            device.release(*inputs)
         self.buffers |= {"nodes": bvh.nodes, "blocks": bvh.blocks}
         return bvh
 
@@ -370,14 +380,12 @@ class Renderer:
         ]
         self.advance = self.film_program.bind_planned("advance_film", self.buffers)
         if self.statistics:
-            census = self.device.allocate("census", np.uint32, OCCUPANCY_BINS)
-            self.buffers["census"] = census
             self.census = self.film_program.bind(
                 "count_depths",
                 params=self.buffers["params"],
                 pool=self.buffers["pool"],
-                census=census,
-                bins=OCCUPANCY_BINS,
+                census=self.buffers["census"],
+                bins=film.CENSUS_BINS,
             )
 
     def _add_launch(self, ring: str, name: str, planes: int, partial: bool) -> Launch:
@@ -399,6 +407,31 @@ class Renderer:
         return [float(share) for share in shares]
 
 
+def prepare_device(text: str | None = None, profiling: bool = False) -> Device:
+    """Open a device and make its tree builder ready: what can be done while a scene is read.
+
+    Args:
+        text: as in ``open_device``.
+    """
+    device = open_device(text, profiling=profiling)
+    warm_up_builder(device)
+    return device
+
+
+def check_budget(spp: int | None, seconds: float | None) -> None:
+    """Refuse a budget that would never end.
+
+    Raises:
+        InputError: not exactly one of ``spp`` (an integer up to 2^31) and ``seconds`` (positive).
+    """
+    if (spp is None) == (seconds is None):
+        raise InputError("give either spp or seconds")
+    if spp is not None and not (isinstance(spp, (int, np.integer)) and 1 <= spp <= 1 << 31):
+        raise InputError(f"spp: expected an integer from 1 to {1 << 31}, got {spp!r}")
+    if seconds is not None and not (math.isfinite(seconds) and seconds > 0):
+        raise InputError(f"seconds: expected a positive number, got {seconds!r}")
+
+
 def render(
     scene: Scene | str | Path,
     preset: str | None = None,
@@ -415,10 +448,14 @@ def render(
         spp, seconds: the budget; 64 samples a pixel if neither is given.
         settings: any field of ``Settings``.
     """
-    if not isinstance(scene, Scene):
-        scene = load_scene(Path(scene))
     if spp is None and seconds is None:
         spp = 64
+    check_budget(spp, seconds)
+    if not isinstance(scene, Scene):
+        with ThreadPoolExecutor(1) as background:
+            preparing = background.submit(prepare_device) if device is None else None
+            scene = load_scene(Path(scene))
+            device = preparing.result() if preparing else device
     renderer = Renderer(scene, resolve(scene.render, scene.path, preset, settings), device, outputs)
     try:
         renderer.render(spp, seconds)

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
 #: Work that may be in flight before the host looks: Ctrl-C and time budgets react this fast.
 BATCH_SECONDS = 0.05
 
+#: Bounces in flight at most, and rays that a path of a full pool traces in each.
+MAX_BOUNCES = 256
+RAYS_PER_BOUNCE = 1.7
+
 #: Bounces between two looks of the film at the ring of samples.
 BOUNCES_PER_FILM = 4
 
@@ -31,7 +35,7 @@ class Progress:
 
 
 @dataclass(frozen=True)
-class Frame:
+class Hooks:
     """What the scheduler drives; the renderer says what each does.
 
     Attributes:
@@ -75,11 +79,12 @@ class Scheduler:
         clock: seconds spent in ``run``.
     """
 
-    def __init__(self, frame: Frame) -> None:
-        self.frame = frame
+    def __init__(self, hooks: Hooks, slots: int) -> None:
+        self.hooks = hooks
+        self.slots = slots
         self.passes = 0
         self.clock = Clock()
-        self.bounces = BOUNCES_PER_FILM
+        self.bounces = 1
 
     def run(
         self,
@@ -97,21 +102,24 @@ class Scheduler:
         Returns:
             Whether it came to its end, that is, was not stopped.
         """
-        first_samples = rays_so_far(self.frame.counters(), "camera")
+        counters = self.hooks.counters()
+        first_samples, last_rays = rays_so_far(counters, "camera"), _all_rays(counters)
         first_seconds = self.clock.now()
         limit = spp
-        self.frame.limit(limit if limit is not None else 0xFFFFFFFF)
+        self.hooks.limit(limit if limit is not None else 0xFFFFFFFF)
         self.clock.start()
         try:
             while limit is None or self.passes < limit:
                 begin = time.perf_counter()
                 for bounce in range(self.bounces):
-                    self.frame.bounce()
-                    if (bounce + 1) % BOUNCES_PER_FILM == 0:
-                        self.frame.film()
-                counters = self.frame.counters()
+                    self.hooks.bounce()
+                    if (bounce + 1) % BOUNCES_PER_FILM == 0 or bounce + 1 == self.bounces:
+                        self.hooks.film()
+                counters = self.hooks.counters()
                 self.passes = int(counters[COUNTER_INDEX["film_pass"]])
-                self._adapt(time.perf_counter() - begin)
+                rays = _all_rays(counters)
+                self._adapt(time.perf_counter() - begin, rays - last_rays)
+                last_rays = rays
                 now = self.clock.now()
                 if progress is not None:
                     samples = rays_so_far(counters, "camera") - first_samples
@@ -121,14 +129,21 @@ class Scheduler:
                 if seconds is not None and limit is None and now >= seconds:
                     # The pass in which the budget ends is finished; later ones are not begun.
                     limit = self.passes + 1
-                    self.frame.limit(limit)
+                    self.hooks.limit(limit)
             return True
         finally:
             self.clock.stop()
 
-    def _adapt(self, seconds: float) -> None:
-        """Let the next batch take about BATCH_SECONDS."""
-        if seconds < BATCH_SECONDS / 2:
-            self.bounces = min(self.bounces * 2, 64 * BOUNCES_PER_FILM)
-        elif seconds > BATCH_SECONDS * 2 and self.bounces > BOUNCES_PER_FILM:
-            self.bounces = max(self.bounces // 2, BOUNCES_PER_FILM)
+    def _adapt(self, seconds: float, rays: int) -> None:
+        """Let the next batch take about BATCH_SECONDS, even if the pool is full from now on.
+
+        A batch of a pool that is nearly empty says little: its few rays look slow, which errs on
+        the side of too little work in flight.
+        """
+        if rays > 0:
+            bounce_seconds = seconds / rays * self.slots * RAYS_PER_BOUNCE
+            self.bounces = min(max(int(BATCH_SECONDS / bounce_seconds), 1), MAX_BOUNCES)
+
+
+def _all_rays(counters: np.ndarray) -> int:
+    return sum(rays_so_far(counters, kind) for kind in ("camera", "bounce", "shadow"))

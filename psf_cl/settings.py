@@ -8,12 +8,25 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from psf_cl.errors import InputError
+from psf_cl.errors import InputError, shown
+
+#: Environment variable that picks a device by a part of its name.
+DEVICE_VARIABLE = "PSF_CL_DEVICE"
+
+#: Images that can be asked for beside the colour, and what is in them.
+AOVS = {
+    "albedo": "reflectance of the first surface seen",
+    "normal": "shading normal there, world space",
+    "depth": "distance to it from the camera, meters",
+    "direct": "light reflected there once, or emitted there",
+    "indirect": "all other light: rgb = direct + indirect",
+    "variance": "of the pixel's mean, estimated from its samples",
+    "samples": "samples of the pixel",
+}
 
 
 def _choice(default: str, *others: str, doc: str) -> Any:
@@ -65,7 +78,7 @@ class Settings:
             if key not in known:
                 close = difflib.get_close_matches(key, known, n=1)
                 hint = f"; did you mean {close[0]}?" if close else f"; known: {', '.join(known)}"
-                raise InputError(f"{source}: unknown setting {key!r}{hint}")
+                raise InputError(f"{source}: unknown setting {shown(key)}{hint}")
             checked[key] = _checked(known[key], value, source)
         return dataclasses.replace(self, **checked)
 
@@ -75,7 +88,7 @@ def _checked(item: dataclasses.Field[Any], value: Any, source: str) -> Any:
     if choices is not None:
         if value not in choices:
             raise InputError(
-                f"{source}: {item.name} must be one of {', '.join(choices)}; got {value!r}"
+                f"{source}: {item.name} must be one of {', '.join(choices)}; got {shown(value)}"
             )
         return value
     low, high = item.metadata["range"]
@@ -87,10 +100,11 @@ def _checked(item: dataclasses.Field[Any], value: Any, source: str) -> Any:
         number = None
     if isinstance(number, bool) or not isinstance(number, (int, float) if kind is float else int):
         raise InputError(
-            f"{source}: {item.name} must be {wanted} from {low} to {high}; got {value!r}"
+            f"{source}: {item.name} must be {wanted} from {low} to {high}; got {shown(value)}"
         )
-    if not (math.isfinite(number) and low <= number <= high):
-        raise InputError(f"{source}: {item.name} must be from {low} to {high}; got {value!r}")
+    # Comparing is exact for integers of any length; no infinity or NaN is in a range.
+    if not low <= number <= high:
+        raise InputError(f"{source}: {item.name} must be from {low} to {high}; got {shown(value)}")
     return kind(number)
 
 
@@ -106,7 +120,7 @@ def preset_values(name: str, source: str = "settings") -> dict[str, Any]:
         InputError: there is no such preset.
     """
     if name not in PRESETS:
-        raise InputError(f"{source}: preset must be one of {', '.join(PRESETS)}; got {name!r}")
+        raise InputError(f"{source}: preset must be one of {', '.join(PRESETS)}; got {shown(name)}")
     return PRESETS[name]
 
 
@@ -127,7 +141,7 @@ def resolve(
     if "preset" in values:
         name = values.pop("preset")
         if not isinstance(name, str):
-            raise InputError(f"{scene_source}: preset must be a string; got {name!r}")
+            raise InputError(f"{scene_source}: preset must be a string; got {shown(name)}")
         settings = settings.with_values(preset_values(name, scene_source), scene_source)
     settings = settings.with_values(values, scene_source)
     if preset is not None:

@@ -9,9 +9,21 @@ import numpy as np
 
 from psf_cl.device import layout
 from psf_cl.errors import InputError
-from psf_cl.scene.model import Camera, Environment, Light, Material, Scene, Texture
-
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+from psf_cl.scene.model import (
+    LUMINANCE,
+    Camera,
+    Environment,
+    Light,
+    Material,
+    Scene,
+    Shape,
+    Texture,
+    emits,
+    has_environment,
+    is_cut_out,
+    is_invisible,
+    shines,
+)
 
 #: Chance that the light table keeps for emitters of finite size where there is also light from
 #: infinitely far: its flux through the scene says little about how much of it comes in.
@@ -27,14 +39,13 @@ class Geometry:
         surfaces: ``(n,)`` layout.SURFACE, ``light`` still NO_LIGHT.
         normals: ``(n,)`` layout.NORMALS, or None if every shape is flat.
         uvs: ``(n,)`` layout.UVS, or None if nothing has coordinates.
-        centre, radius: a sphere around all finite vertices; m.
+        radius: of a sphere around all finite vertices; m.
     """
 
     positions: np.ndarray
     surfaces: np.ndarray
     normals: np.ndarray | None
     uvs: np.ndarray | None
-    centre: np.ndarray
     radius: float
 
     @property
@@ -42,12 +53,18 @@ class Geometry:
         return len(self.surfaces)
 
 
+def visible_shapes(scene: Scene) -> list[Shape]:
+    """Return the shapes that a ray can hit."""
+    return [shape for shape in scene.shapes if not is_invisible(scene.materials[shape.material])]
+
+
 def flatten(scene: Scene) -> Geometry:
-    """Return the triangles of all shapes, in the order of the shapes."""
+    """Return the triangles of all visible shapes, in the order of the shapes."""
     positions, surfaces, normals, uvs = [], [], [], []
-    smooth = any(shape.mesh.normals is not None for shape in scene.shapes)
-    mapped = any(shape.mesh.uvs is not None for shape in scene.shapes)
-    for shape in scene.shapes:
+    shapes = visible_shapes(scene)
+    smooth = any(shape.mesh.normals is not None for shape in shapes)
+    mapped = any(shape.mesh.uvs is not None for shape in shapes)
+    for shape in shapes:
         mesh = shape.mesh
         linear = shape.transform[:3, :3]
         with np.errstate(
@@ -91,7 +108,6 @@ def flatten(scene: Scene) -> Geometry:
         joined(surfaces, layout.SURFACE.dtype),
         joined(normals, layout.NORMALS.dtype) if smooth else None,
         joined(uvs, layout.UVS.dtype) if mapped else None,
-        (low + high) / 2,
         float(np.linalg.norm(high - low)) / 2,
     )
 
@@ -114,18 +130,6 @@ def _world_normals(normals: np.ndarray, linear: np.ndarray) -> np.ndarray:
         unit = world / length
     unit[~np.isfinite(unit).all(axis=1)] = 0.0
     return unit.astype(np.float32)
-
-
-def is_cut_out(material: Material) -> bool:
-    """Return whether hits on ``material`` must look up its alpha."""
-    if material.alpha_mode != "mask":
-        return False
-    return material.base_color_texture >= 0 or material.alpha < material.alpha_cutoff
-
-
-def emits(material: Material) -> bool:
-    """Return whether ``material`` is a light."""
-    return max(material.emission) > 0.0
 
 
 def material_table(materials: tuple[Material, ...]) -> np.ndarray:
@@ -268,12 +272,13 @@ def light_table(scene: Scene, geometry: Geometry, sampling: str) -> tuple[np.nda
     triangles, area = triangles[sound], area[sound]
 
     sky = has_environment(scene.environment)
-    punctual = [light for light in scene.lights if max(light.intensity) > 0.0]
+    punctual = [light for light in scene.lights if shines(light)]
     table = np.zeros(len(triangles) + sky + len(punctual), layout.LIGHT.dtype)
     power = np.zeros(len(table))
     far = np.zeros(len(table), bool)
     table["kind"][: len(triangles)] = layout.CONSTANT["LIGHT_TRIANGLE"]
     table["triangle"][: len(triangles)] = triangles
+    table["area"][: len(triangles)] = area
     geometry.surfaces["light"][triangles] = np.arange(len(triangles))
     of = material[triangles]
     power[: len(triangles)] = area * radiance[of] * sided[of] * math.pi
@@ -334,13 +339,6 @@ def _mean_emission(scene: Scene, material: Material) -> np.ndarray:
     colors = texture.pixels[..., :3].reshape(-1, 3)
     linear = srgb_to_linear()[colors] if texture.srgb else colors / 255.0
     return emission * linear.mean(axis=0)
-
-
-def has_environment(environment: Environment) -> bool:
-    """Return whether any light comes from infinitely far away."""
-    if max(environment.radiance) <= 0.0:
-        return False
-    return environment.image is None or bool((environment.image > 0.0).any())
 
 
 def _environment_weights(image: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ import numpy as np
 import PIL.Image
 import pytest
 
+import psf_cl.image
 from psf_cl.cli.main import main
 from psf_cl.cli.progress import describe, seconds_left
 from psf_cl.errors import DeviceError
@@ -215,7 +216,7 @@ BAD_USAGE = {
     "render a.toml --crop 0,0,5": "--crop",
     "render a.toml --crop 0,0,0,5": "--crop",
     "render a.toml --crop -1,0,5,5": "--crop",
-    "render a.toml --crop 4,0,5,5": "leaves the picture, 8x6",
+    "render a.toml --crop 4,0,5,5": "--crop: 4,0,5,5",
     "render a.toml --exposure big": "--exposure",
     "render a.toml --set max_depth": "key=value",
     "render --set max_depth=1 a.toml": "before --set",
@@ -291,6 +292,24 @@ def test_the_first_ctrl_c_keeps_what_is_rendered(fake, tmp_path, capsys):
     assert read_exr("a.exr").stats["spp"] == 3
     captured = capsys.readouterr()
     assert captured.out.startswith("a.exr: 3 spp") and "interrupted" in captured.err
+
+
+@pytest.mark.parametrize("moment", ["image", "write_exr", "write_png"])
+def test_ctrl_c_after_the_last_pass_still_writes_everything(
+    fake, tmp_path, capsys, monkeypatch, moment
+):
+    owner = fake if moment == "image" else psf_cl.image
+    work = getattr(owner, moment)
+
+    def pressed(*arguments):
+        signal.raise_signal(signal.SIGINT)
+        return work(*arguments)
+
+    monkeypatch.setattr(owner, moment, pressed)
+    assert main("render a.toml --spp 2 --stats s.json".split()) == 130
+    assert files_in(tmp_path) == ["a.exr", "a.png", "s.json"]
+    assert read_exr("a.exr").stats["spp"] == 2
+    assert "what was rendered is written" in capsys.readouterr().err
 
 
 def test_the_second_ctrl_c_stops_at_once_and_writes_nothing(fake, tmp_path, capsys):
@@ -405,6 +424,26 @@ def test_plan_follows_the_options(all_features, capsys):
     assert off == {"AOV_DIRECT", "AOV_FEATURES"} and plan["crop"] == [0, 0, 24, 16]
     plan, off = features("--camera above --aov direct --crop 1,2,3,4")
     assert off == {"LENS", "AOV_FEATURES"} and plan["crop"] == [1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("output", ["sky.exr", "checks.exr", "box.exr"])
+def test_no_file_that_the_scene_names_is_overwritten(all_features, capsys, output):
+    (all_features / "box.obj").write_text("mtllib box.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    (all_features / "box.mtl").write_text("newmtl a\nmap_Kd box.png\n")
+    PIL.Image.new("RGB", (2, 2)).save(all_features / "box.png")
+    with open("all.toml", "a") as file:
+        file.write('[[shapes]]\nmesh = "box.obj"\n')
+    before = {path: path.read_bytes() for path in all_features.iterdir()}
+    assert main(["render", "all.toml", "--spp", "1", "-o", output]) == 2
+    assert "it is another input or output" in one_error(capsys.readouterr())
+    assert {path: path.read_bytes() for path in all_features.iterdir()} == before
+
+
+def test_plan_is_for_the_kind_of_device_that_was_asked_for(all_features, capsys):
+    for kind, slots in (("cpu", 1 << 15), ("gpu", 1 << 18)):
+        assert main(["plan", "all.toml", "--kind", kind]) == 0
+        assert f"for a {kind.upper()}: {slots} paths in flight" in capsys.readouterr().out
+    assert main(["plan", "all.toml", "--kind", "toaster"]) == 2
 
 
 def rendered(arguments):

@@ -119,40 +119,60 @@ def test_sums_go_on_growing_when_a_sample_is_far_below_their_last_digit(film):
     np.testing.assert_allclose(sums_of(found), np.tile(expected, (8, 1)), rtol=0, atol=2e-3)
 
 
-def test_samples_that_are_not_finite_are_counted_and_left_out(film):
-    samples = np.ones((16, 4))
-    bad = [np.nan, np.inf, -np.inf, -np.nan]
-    for k, value in enumerate(bad):
+def hand_in(device, radiance, direct):
+    """Let regenerate_paths hand in finished paths; return both rings and the rejected samples."""
+    traits, count = device.traits, len(radiance)
+    pool = np.zeros((traits.slots // traits.block, len(layout.PATH_FIELDS), traits.block), "f4")
+    places = {name: index for index, (name, _) in enumerate(layout.PATH_FIELDS)}
+    slot = np.arange(count)
+    at = slot // traits.block, slot % traits.block
+    for field, values in (("radiance_r", radiance), ("direct_r", direct)):
         for channel in range(3):
-            samples[3 * k + channel, channel] = value
-    f = film(16, ring=2)
-    f.put(0, samples)
-    f.put(1, np.full((16, 4), [2.0, 3.0, 4.0, 1.0]))
-    f.launch()
-    (found,) = f.read()
-    assert f.count("rejected_samples") == 12
-    good = np.arange(16)[:, None] >= 12
-    np.testing.assert_array_equal(found["sum"], np.where(good, [3, 4, 5], [2, 3, 4]))
-    # A rejected sample counts as black: the mean must not depend on how many there were.
-    np.testing.assert_array_equal(found["count"], 2)
-    for name in ("sum", "lost", "mean", "squares"):
-        assert np.isfinite(found[name]).all()
+            pool[at[0], places[field] + channel, at[1]] = values[:, channel]
+    words = pool.view(np.uint32)
+    words[at[0], places["status"], at[1]] = layout.CONSTANT["STATUS_DONE"]
+    words[at[0], places["pixel"], at[1]] = slot
+    params = np.zeros(1, layout.PARAMS.dtype)
+    params["pixel_count"], params["ring"], params["slots"] = count, 1, traits.slots
+    buffers = {
+        "params": device.upload("params", params),
+        "pixel_order": device.allocate("pixel_order", np.uint32, count),
+        "pool": device.upload("pool", pool.ravel()),
+        "counters": device.allocate("counters", np.uint32, AT["finished"] + 1),
+        "samples": device.allocate("samples", np.float32, count * 4),
+        "direct": device.allocate("direct", np.float32, count * 4),
+    }
+    flags = (
+        "TEXTURES ALPHA SMOOTH TRANSMISSION AREA_LIGHTS PUNCTUAL_LIGHTS ENVIRONMENT CONNECT LENS"
+        " AOV_FEATURES"
+    ).split()
+    program = load_program(device, "camera.cl", dict.fromkeys(flags, 0) | {"AOV_DIRECT": 1})
+    program.bind("regenerate_paths", **buffers)(traits.slots // traits.lanes)
+    rings = [device.read(buffers[name]).reshape(count, 4) for name in ("samples", "direct")]
+    counters = device.read(buffers["counters"])
+    device.release(*buffers.values())
+    assert counters[AT["finished"]] == count
+    return *rings, counters[AT["rejected_samples"]]
 
 
-def test_values_are_summed_up_to_where_sums_could_overflow(film):
+def test_samples_that_cannot_be_summed_are_handed_in_as_black_and_counted(lane_device):
     largest = float(np.nextafter(np.float32(2.0**96), np.float32(0)))
-    f = film(3, ring=1)
-    f.put(0, [[[-1.0, 0.0, largest, 1.0]] * 3])
-    f.launch()
-    (found,) = f.read()
-    np.testing.assert_array_equal(found["sum"], np.float32([[-1.0, 0.0, largest]] * 3))
-    assert f.count("rejected_samples") == 0
-    f.put(1, [2.0**96, 1.0, 1.0, 1.0])
-    f.launch()
-    assert f.count("rejected_samples") == 3
-    (found,) = f.read()
-    np.testing.assert_array_equal(found["sum"], np.float32([[-1.0, 0.0, largest]] * 3))
-    assert np.isfinite(found["squares"]).all()
+    radiance = np.ones((40, 3), np.float32)
+    direct = np.full((40, 3), 0.5, np.float32)
+    for k, value in enumerate([np.nan, np.inf, -np.inf, -np.nan, 2.0**96, -(2.0**96)]):
+        for channel in range(3):
+            radiance[3 * k + channel, channel] = value
+    radiance[20] = [-1.0, 0.0, largest]
+    direct[25, 1] = np.nan
+    samples, parts, rejected = hand_in(lane_device, radiance, direct)
+    bad = np.arange(40) < 18
+    bad[25] = True
+    assert rejected == 19
+    np.testing.assert_array_equal(samples[:, :3], np.where(bad[:, None], 0, radiance))
+    # The direct part goes with the whole, or the indirect part would be negative.
+    np.testing.assert_array_equal(parts[:, :3], np.where(bad[:, None], 0, direct))
+    # A rejected sample counts as black: the mean must not depend on how many there were.
+    assert (samples[:, 3] == 1).all() and (parts[:, 3] == 1).all()
 
 
 def test_samples_without_weight_are_no_samples(film):
@@ -165,7 +185,6 @@ def test_samples_without_weight_are_no_samples(film):
     (found,) = f.read()
     np.testing.assert_array_equal(found["count"], [0, 1] * 5)
     np.testing.assert_array_equal(found["sum"][:, 0], [0, 1] * 5)
-    assert f.count("rejected_samples") == 0
 
 
 def test_passes_are_added_whole_and_in_order(film):

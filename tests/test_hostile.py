@@ -14,7 +14,7 @@ import PIL.Image
 import pytest
 
 from psf_cl.cli.main import main
-from psf_cl.image import Image, write_exr
+from psf_cl.image import Image, read_exr, write_exr
 
 SCENE = '[[shapes]]\nprimitive = "quad"\n'
 RUN = "--size 8x8 --spp 1 -o out.exr"
@@ -50,6 +50,19 @@ def glb(document: dict[str, object]) -> bytes:
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def zeros_gltf(nodes: int, primitives: int, count: int = 1 << 20) -> str:
+    """Return a small glTF file of very many triangles whose corners are all zero."""
+    primitive = {"attributes": {"POSITION": 0}}
+    return json.dumps(
+        {
+            "asset": {"version": "2.0"},
+            "meshes": [{"primitives": [primitive] * primitives}],
+            "nodes": [{"mesh": 0}] * nodes,
+            "accessors": [{"componentType": 5126, "count": count, "type": "VEC3"}],
+        }
+    )
 
 
 def obj(*lines: str) -> str:
@@ -122,6 +135,21 @@ BAD_SCENES: dict[str, tuple[str, object, str]] = {
     "not a number": ("a.toml", SCENE + "[camera]\nfov_y = nan", "camera.fov_y"),
     "unknown setting": ("a.toml", SCENE + "[render]\nmax_dept = 4", "did you mean max_depth"),
     "setting of a wrong type": ("a.toml", SCENE + "[render]\nseed = 1.5", "seed"),
+    "a setting of 400 digits": (
+        "a.toml",
+        SCENE + f"[render]\nmax_depth = 1{'0' * 400}",
+        "max_depth must be from 0 to 1048576; got 1000",
+    ),
+    "a setting that cannot be printed": (
+        "a.toml",
+        SCENE + f"[render]\nmax_depth = 0x{'f' * 5000}",
+        "max_depth must be from 0 to 1048576; got a huge integer",
+    ),
+    "a choice that cannot be printed": (
+        "a.toml",
+        SCENE + f"[render]\nsampler = [0x{'f' * 5000}]",
+        "sampler must be one of sobol, random; got a huge integer",
+    ),
     "unknown preset": ("a.toml", SCENE + "[render]\npreset = 'fast'", "preset"),
     "huge film": ("a.toml", SCENE + "[film]\nwidth = 1000000000000", "film.width"),
     "missing mesh": ("a.toml", '[[shapes]]\nmesh = "no.obj"', "no.obj"),
@@ -140,6 +168,12 @@ BAD_SCENES: dict[str, tuple[str, object, str]] = {
         b"ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\nproperty float x\n"
         b"property float y\nproperty float z\nend_header\n",
         "not a sound PLY file",
+    ),
+    "a billion triangles in many places": ("a.gltf", zeros_gltf(3000, 1), "134217728 triangles"),
+    "billions of zeros": (
+        "a.gltf",
+        zeros_gltf(1, 1, count=1 << 25),
+        "accessors[0].count: expected at most 16777216",
     ),
     "empty GLB": ("a.glb", b"", "GLB"),
     "cut GLB": ("a.glb", glb(triangle_gltf())[:-20], "truncated"),
@@ -169,14 +203,17 @@ BAD_OPTIONS = {
     "--size 99999x99999": "99999x99999",
     "--size 0x0": "--size",
     f"--size {'9' * 5000}x9": "--size",
-    "--crop 0,0,9,9": "leaves the picture",
-    "--crop 8,8,1,1": "leaves the picture",
-    "--crop 99999999999,0,1,1": "leaves the picture",
+    "--crop 0,0,9,9": "--crop: 0,0,9,9",
+    "--crop 8,8,1,1": "--crop: 8,8,1,1",
+    "--crop 99999999999,0,1,1": "--crop: 99999999999,0,1,1",
     "--crop a,b,c,d": "--crop",
     "--aov beauty": "--aov",
     "--aov ,": "--aov",
     "--seed 4294967296": "seed",
     "--seed 1.5": "seed",
+    f"--seed {'9' * 400}": "seed must be from 0 to 4294967295; got '9999",
+    f"--seed {'9' * 5000}": "seed must be an integer",
+    f"--set max_depth=-{'9' * 400}": "max_depth must be from 0",
     "--set max_depth=1e400": "max_depth",
     "--set max_depth=": "max_depth",
     "--set sampler=halton": "sampler must be one of sobol, random",
@@ -244,6 +281,13 @@ def test_a_bad_scene_is_one_line(folder, capfd, case):
         assert name in error and expected in error
 
 
+def test_triangles_are_counted_before_all_meshes_are_made(folder, capfd, monkeypatch):
+    monkeypatch.setattr("psf_cl.scene.gltf.MAX_TRIANGLES", 14)
+    (folder / "a.gltf").write_text(zeros_gltf(1, 1000, count=9))
+    error = refused(["plan", "a.gltf"], capfd, folder)
+    assert "meshes[0].primitives[4].indices: expected at most 14 triangles in all meshes" in error
+
+
 @pytest.mark.parametrize("options", BAD_OPTIONS, ids=lambda options: options[:40])
 def test_a_bad_option_is_one_line(folder, capfd, options):
     (folder / "good.toml").write_text(SCENE)
@@ -299,3 +343,50 @@ def test_file_names_may_be_any_bytes(folder, capfd):
 
 def test_a_name_with_a_line_break_is_still_one_line(folder, capfd):
     assert "a b.toml" in refused(["render", "a\nb.toml", *RUN.split()], capfd, folder)
+
+
+def assert_render_is_quiet(capfd, scene: str, note: str) -> None:
+    assert main(["render", scene, *RUN.split()]) == 0
+    told = capfd.readouterr().err
+    assert told.count("\n") == 2 and told.startswith("note: ") and note in told
+    pixels = read_exr("out.exr").rgb
+    assert np.isfinite(pixels).all() and pixels.max() > 1e10
+
+
+def test_light_beyond_float32_in_an_mtl_file_is_limited_and_told(device, folder, capfd):
+    (folder / "a.obj").write_text("mtllib a.mtl\n" + obj("usemtl lamp", "f 1 2 3"))
+    (folder / "a.mtl").write_text("newmtl lamp\nKe 1e308 1e308 1\n")
+    assert_render_is_quiet(capfd, "a.obj", "Ke of lamp above 1e+20 is set to that")
+
+
+def test_light_beyond_float32_in_a_gltf_file_is_limited_and_told(device, folder, capfd):
+    document = triangle_gltf()
+    strength = {"KHR_materials_emissive_strength": {"emissiveStrength": 3e38}}
+    document["materials"] = [{"emissiveFactor": [1, 1, 1], "extensions": strength}]
+    document["meshes"][0]["primitives"][0]["material"] = 0
+    light = {"type": "directional", "intensity": 3e38}
+    document["extensions"] = {"KHR_lights_punctual": {"lights": [light]}}
+    document["nodes"] = [{"mesh": 0, "extensions": {"KHR_lights_punctual": {"light": 0}}}]
+    (folder / "a.glb").write_bytes(glb(document))
+    assert_render_is_quiet(capfd, "a.glb", "above 1e+20 are set to that (2 times)")
+
+
+@pytest.mark.parametrize("value", ["inf", "1e400", "nan"])
+def test_light_that_is_not_finite_is_one_line(folder, capfd, value):
+    (folder / "a.obj").write_text("mtllib a.mtl\n" + obj("usemtl lamp", "f 1 2 3"))
+    (folder / "a.mtl").write_text(f"newmtl lamp\nKe 1 {value} 1\n")
+    error = refused(["render", "a.obj", *RUN.split()], capfd, folder)
+    assert "a.obj: material lamp: Ke: expected finite numbers" in error
+
+
+def test_a_sky_beyond_float32_is_limited_and_told(device, folder, capfd):
+    write_exr("sky.exr", Image({"rgb": np.full((2, 4, 3), 3e38, np.float32)}))
+    (folder / "a.toml").write_text(SCENE + '[environment]\nimage = "sky.exr"\n')
+    arguments = [*RUN.split(), "--quiet"]
+    assert main(["render", "a.toml", *arguments]) == 0
+    assert capfd.readouterr().err == ""
+    assert np.isfinite(read_exr("out.exr").rgb).all()
+    (folder / "out.exr").unlink()
+    (folder / "out.png").unlink()
+    (folder / "a.toml").write_text(SCENE + '[environment]\nimage = "sky.exr"\nscale = 2\n')
+    assert "environment.scale" in refused(["render", "a.toml", *arguments], capfd, folder)

@@ -82,8 +82,8 @@ class Lit:
         )
         return toward.T, wi.T, radiance.T, pdf, extended
 
-    def density(self, light, distance, cosine, area):
-        hits = np.stack([distance, cosine, area]).astype(np.float32)
+    def density(self, light, distance, cosine):
+        hits = np.stack([distance, cosine]).astype(np.float32)
         inputs = {"light": np.asarray(light, np.uint32), "hits": hits}
         outputs = {"pdfs": (np.float32, 1)}
         return self.run("list_densities", inputs, outputs, lights=self.buffers["lights"])[0]
@@ -174,7 +174,7 @@ def intersect(corners, origin, direction):
 def test_density_seen_by_rays_integrates_to_the_chance_of_the_light(lit):
     scene = triangles_scene(CORNERS, GLOW, [2, 1, 1, 2])
     table = lit(scene)
-    area, normal = areas_and_normals(CORNERS)
+    _, normal = areas_and_normals(CORNERS)
     directions = sphere_directions(200_000)
     origin = np.array([0.1, 0.2, -0.3])
     for k in range(len(CORNERS)):
@@ -182,7 +182,7 @@ def test_density_seen_by_rays_integrates_to_the_chance_of_the_light(lit):
         hit = np.isfinite(t)
         cosine = abs(directions[hit] @ normal[k])
         light = np.full(hit.sum(), scene_light(table, k))
-        pdf = table.density(light, t[hit], cosine, np.full(hit.sum(), area[k]))
+        pdf = table.density(light, t[hit], cosine)
         integral = pdf.astype(np.float64).sum() * 4 * np.pi / len(directions)
         # Some ten thousand directions: their edge is what the sum does not know.
         np.testing.assert_allclose(integral, table.lights["pmf"][light[0]], rtol=5e-3)
@@ -240,7 +240,7 @@ def test_area_lights_are_drawn_by_power_uniformly_with_the_density_that_rays_see
     t = np.linalg.norm(toward[on].astype(np.float64), axis=1)
     expected = pmf[chosen] * t**2 / (cosine * area[chosen])
     np.testing.assert_allclose(pdf[on], expected, rtol=2e-5)
-    seen = table.density(table.geometry.surfaces["light"][chosen], t, cosine, area[chosen])
+    seen = table.density(table.geometry.surfaces["light"][chosen], t, cosine)
     np.testing.assert_allclose(pdf[on], seen, rtol=2e-5)
 
     for k in lights:

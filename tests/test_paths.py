@@ -537,3 +537,29 @@ def test_error_falls_with_the_number_of_samples_to_a_thousand(device):
     assert abs(slope(spps, errors["random"]) + 1.0) < 0.1
     assert slope(spps, errors["sobol"]) < -0.9
     assert (errors["sobol"] < 1.05 * errors["random"]).all()
+
+
+@pytest.mark.parametrize("strategy", ["mis", "light", "bsdf"])
+def test_holes_of_a_cut_out_emitter_give_no_light(device, strategy):
+    """A quad of which a texture leaves the half x < 0 lights like the half alone."""
+    pixels = np.full((2, 2, 4), 255, np.uint8)
+    pixels[:, 1, 3] = 0
+    holes = Texture("holes", pixels, wrap=("clamp", "clamp"), filter="nearest")
+    down = transform.translation((0, 1, 0)) @ transform.rotation_xyz_degrees((180, 0, 0))
+    half = down @ transform.translation((-0.5, 0, 0)) @ transform.scaling((0.5, 1, 1))
+    masked = glowing(3.0, alpha_mode="mask", base_color_texture=0)
+    cut_out = on_floor([(primitives.quad(), down, masked)], textures=[holes])
+    alone = on_floor([(primitives.quad(), half, glowing(3.0))])
+    images = [
+        render(
+            device,
+            scene,
+            1024,
+            ["variance"],
+            sampler="random",
+            max_depth=1,
+            direct_sampling=strategy,
+        )
+        for scene in (cut_out, alone)
+    ]
+    assert np.abs(z_scores(*images, 2)).max() < Z_LIMIT

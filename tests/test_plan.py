@@ -23,7 +23,9 @@ from psf_cl.device.device import open_device
 from psf_cl.device.program import assemble, load_program
 from psf_cl.device.sources import kernel_folder
 from psf_cl.errors import InputError
-from psf_cl.plan import AOVS, make_plan
+from psf_cl.image import AOVS
+from psf_cl.plan import make_plan
+from psf_cl.renderer import Renderer
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.model import Environment, Light, Material, Texture
 from psf_cl.settings import Settings
@@ -36,7 +38,11 @@ FLAT_QUAD = primitives.quad()
 #: What a flag of the plan needs: shapes, lights, a sky, a lens or an AOV.
 PARTS = {
     "TEXTURES": (FLAT_QUAD, LIFTED, lambertian(0.5, base_color_texture=0)),
-    "ALPHA": (FLAT_QUAD, LOW, lambertian(0.5, alpha=0.2, alpha_mode="mask")),
+    "ALPHA": (
+        FLAT_QUAD,
+        LOW,
+        lambertian(0.5, base_color_texture=0, alpha=0.2, alpha_mode="mask"),
+    ),
     "SMOOTH": (primitives.sphere(8, 6), LIFTED, lambertian(0.5)),
     "TRANSMISSION": (primitives.box(), LIFTED, Material(transmission=1.0, roughness=0.3)),
     "AREA_LIGHTS": (inside_out(FLAT_QUAD), LIFTED, glowing(3.0)),
@@ -77,14 +83,19 @@ def with_flags(*flags):
         (8, 8),
         lights=[LIGHTS[flag] for flag in flags if flag in LIGHTS],
         environment=sky,
-        textures=[LEVELS] if "TEXTURES" in flags else (),
+        textures=[LEVELS] if {"TEXTURES", "ALPHA"} & set(flags) else (),
     )
     return scene, [OUTPUTS[flag] for flag in flags if flag in OUTPUTS]
 
 
 def values_of(flags):
     """Return the macros that are not 0 for these flags."""
-    return {flag.split()[0]: 2 if flag.endswith("image") else 1 for flag in flags}
+    values = {flag.split()[0]: 2 if flag.endswith("image") else 1 for flag in flags}
+    if "ALPHA" in values:
+        values["TEXTURES"] = 1
+    if values.keys() & {"AREA_LIGHTS", "PUNCTUAL_LIGHTS", "ENVIRONMENT"}:
+        values["CONNECT"] = 1
+    return values
 
 
 @pytest.fixture(scope="module")
@@ -155,6 +166,48 @@ def test_what_is_cut_out_whole_is_not_there(narrow):
     np.testing.assert_allclose(pictures[0], pictures[1], rtol=1e-4)
 
 
+def test_a_shape_that_no_ray_can_hit_is_left_out(narrow):
+    scene, _ = with_flags("AREA_LIGHTS", "TEXTURES")
+    nothing = Material(alpha_mode="mask", alpha=0.2, base_color=(1, 1, 1), emission=(5, 5, 5))
+    materials = (*scene.materials, nothing)
+    shape = replace(scene.shapes[0], material=len(materials) - 1, transform=LOW)
+    more = replace(scene, materials=materials, shapes=(*scene.shapes, shape))
+    pictures = []
+    for variant in (scene, more):
+        opened = renderer(narrow, variant)
+        opened.render(spp=2)
+        pictures.append(opened.image().rgb)
+        lights = opened.buffers["lights"].count
+        opened.close()
+    np.testing.assert_array_equal(pictures[0], pictures[1])
+    assert lights == 2
+    plan = make_plan(more, Settings())
+    assert not plan.features["ALPHA"].value
+    assert ("shapes", "1 are cut out whole") in plan.left_out
+
+
+@pytest.mark.parametrize(
+    ("settings", "flag", "planned"),
+    [
+        ({"max_depth": 0}, "PUNCTUAL_LIGHTS", False),
+        ({"max_depth": 0}, "AREA_LIGHTS", False),
+        ({"direct_sampling": "bsdf"}, "AREA_LIGHTS", False),
+        ({"direct_sampling": "bsdf"}, "ENVIRONMENT image", False),
+        ({"direct_sampling": "bsdf"}, "PUNCTUAL_LIGHTS", True),
+        ({"direct_sampling": "light"}, "AREA_LIGHTS", True),
+    ],
+)
+def test_lights_are_sampled_only_where_the_settings_do(narrow, settings, flag, planned):
+    scene, _ = with_flags(flag)
+    opened = Renderer(scene, Settings(**settings), narrow)
+    assert bool(opened.plan.features["CONNECT"].value) == planned
+    assert ("lights" in opened.buffers) == planned
+    assert ("connect" in [stage.name for stage in opened.plan.stages]) == planned
+    opened.render(spp=2)
+    assert np.isfinite(opened.image().rgb).all()
+    opened.close()
+
+
 def test_every_flag_at_once_renders(narrow):
     flags = [flag for flag in CHOICES if flag != "ENVIRONMENT"]
     scene, _ = with_flags(*flags)
@@ -170,7 +223,8 @@ def test_every_flag_at_once_renders(narrow):
 
 def pairs():
     """Return pairs of flags that are not two values of one."""
-    return [p for p in itertools.combinations(CHOICES, 2) if len(values_of(p)) == 2]
+    pairs = itertools.combinations(CHOICES, 2)
+    return [(a, b) for a, b in pairs if a.split()[0] != b.split()[0]]
 
 
 def test_planned_bytes_are_those_that_are_allocated(narrow):
@@ -243,8 +297,7 @@ def test_unused_materials_and_black_lights_bring_nothing():
         environment=Environment((0.0, 0.0, 0.0), np.ones((2, 4, 3), np.float32)),
     )
     plan = make_plan(scene, Settings())
-    assert {n for n, f in plan.features.items() if f.value} == {"AREA_LIGHTS"}
-    assert ("materials", "1 are on no shape") in plan.left_out
+    assert {n for n, f in plan.features.items() if f.value} == {"AREA_LIGHTS", "CONNECT"}
 
 
 @pytest.mark.parametrize("crop", [(0, 0, 9, 8), (-1, 0, 4, 4), (0, 0, 0, 4), (7, 7, 2, 1)])

@@ -137,3 +137,11 @@ def test_planned_buffers_are_found_by_name_and_lacking_ones_named(device, fill):
     program, out = fill
     with pytest.raises(TypeError, match="missing count, offset, value"):
         program.bind_planned("fill", {"out": out, "unused": out})
+
+
+def test_an_include_inside_a_condition_is_refused(tmp_path):
+    """It would be expanded there, once, and might be cut away for those who need it."""
+    (tmp_path / "part.h").write_text("#define PART 1\n")
+    (tmp_path / "whole.cl").write_text('#if 1\n#include "part.h"\n#endif\n')
+    with pytest.raises(DeviceError, match=r"whole\.cl:2: an include inside a condition"):
+        assemble("whole.cl", tmp_path)

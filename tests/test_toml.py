@@ -236,18 +236,44 @@ def test_a_scene_with_any_light_keeps_its_environment(folder, light):
     assert not any("no light" in note for note in scene.notes)
 
 
-def test_the_framing_view_shows_every_vertex(folder):
+@pytest.mark.parametrize("primitive", ["box", "sphere"])
+def test_the_framing_view_shows_every_vertex(folder, primitive):
     film = "[film]\nwidth = 100\nheight = 300\n"
-    steps = "transform = [{ scale = [9, 0.1, 2] }, { translate = [100, -50, 3] }]\n"
-    scene = load(folder, film + '[[shapes]]\nprimitive = "box"\n' + steps)
+    part = f'[[shapes]]\nprimitive = "{primitive}"\ntransform = [{{ scale = [9, 0.1, 2] }}, '
+    near, far = "{ translate = [100, -50, 3] }]\n", "{ rotate = [30, 50, 70] }]\n"
+    scene = load(folder, film + part + near + part + far)
     (camera,) = scene.cameras
-    shape = scene.shapes[0]
-    world = transform_points(shape.transform, shape.mesh.positions)
+    world = np.concatenate(
+        [transform_points(shape.transform, shape.mesh.positions) for shape in scene.shapes]
+    )
     seen = transform_points(np.linalg.inv(camera.transform), world)
     slope_y = math.tan(camera.fov_y / 2)
     assert (seen[:, 2] < 0).all()
     assert (np.abs(seen[:, 1]) <= slope_y * -seen[:, 2]).all()
     assert (np.abs(seen[:, 0]) <= slope_y / 3 * -seen[:, 2]).all()
+
+
+def test_a_texture_of_light_that_is_not_there_is_left_out(folder):
+    used = textured_quad(folder, "emission = [0, 0, 1]\n")
+    assert len(used.textures) == 1 and used.materials[0].emission_texture == 0
+    dark = textured_quad(folder, "")
+    assert dark.textures == () and dark.materials[0].emission_texture == -1
+
+
+def textured_quad(folder, more):
+    Image.new("RGB", (2, 2)).save(folder / "glow.png")
+    material = f'[materials.m]\nemission_texture = "glow.png"\n{more}'
+    return load(folder, material + QUAD + 'material = "m"\n')
+
+
+def test_every_file_that_was_read_is_known(folder):
+    Image.new("RGB", (2, 2)).save(folder / "glow.png")
+    (folder / "skin.obj").write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\n")
+    (folder / "a.mtl").write_text("newmtl a\nmap_Kd glow.png\n")
+    scene = load(folder, '[[shapes]]\nmesh = "skin.obj"\n')
+    names = {Path(name).name for name in scene.files}
+    assert names == {"scene.toml", "skin.obj", "a.mtl", "glow.png"}
+    assert all(Path(name).is_file() for name in scene.files)
 
 
 def test_cameras_are_picked_by_name(folder):

@@ -25,6 +25,9 @@
 #ifndef ENVIRONMENT
 #error "ENVIRONMENT must be 0 (none), 1 (constant) or 2 (image)"
 #endif
+#ifndef CONNECT
+#error "CONNECT must be 0 or 1"
+#endif
 #ifndef LENS
 #error "LENS must be 0 or 1"
 #endif

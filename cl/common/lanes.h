@@ -108,7 +108,6 @@ inline UInt lanes_before(Mask mask)
 
 #define PI 3.14159265358979f
 #define INV_PI 0.318309886183791f
-#define ONE_BELOW 0.99999994f
 
 /// Three values a lane: a vector, a point or a colour.
 typedef struct {
@@ -144,7 +143,6 @@ inline Vec3 pick_v(Mask mask, Vec3 then, Vec3 otherwise)
 }
 inline Vec3 lerp3(Vec3 a, Vec3 b, Float t) { return add_scaled(a, sub(b, a), t); }
 inline Float max3(Vec3 a) { return max(a.x, max(a.y, a.z)); }
-inline Float luminance(Vec3 c) { return 0.2126f * c.x + 0.7152f * c.y + 0.0722f * c.z; }
 
 /// Unit vector along `v`, also where the square of its length would leave the range of float;
 /// (0, 0, 1) where `v` has no direction, or is too small for its reciprocal.

@@ -80,8 +80,7 @@
 #define COUNTER_PENDING_CAMERA 11u // rays since the last film launch
 #define COUNTER_PENDING_BOUNCE 12u
 #define COUNTER_PENDING_SHADOW 13u
-#define COUNTER_STACK_OVERFLOWS 14u // traversal stacks that were full
-#define COUNTER_FINISHED 15u // first of the ring: samples done of each pass in flight
+#define COUNTER_FINISHED 14u // first of the ring: samples done of each pass in flight
 
 /// Everything that is the same for all paths of a render.
 typedef struct {
@@ -95,9 +94,6 @@ typedef struct {
     float film_scale_y; // tangent of half the vertical field of view
     uint width; // pixels of the whole film
     uint height; // pixels of the whole film
-    uint crop_x; // first column that is rendered
-    uint crop_y; // first row that is rendered
-    uint crop_width; // columns that are rendered
     uint pixel_count; // pixels that are rendered
     uint ring; // passes that may be in flight
     uint slots; // paths of the pool
@@ -105,8 +101,6 @@ typedef struct {
     uint max_depth; // bounces
     uint roulette_depth; // bounces before roulette
     uint light_count; // entries of the light table
-    uint triangle_count; // entries of the triangle tables
-    uint material_count; // entries of the material table
     uint environment_width; // texels
     uint environment_height; // texels
     float environment_radiance[3]; // constant sky, or factor of the image
@@ -115,6 +109,7 @@ typedef struct {
     float scene_radius; // m, of the bounding sphere
     uint direct_sampling; // DIRECT_MIS, DIRECT_LIGHT or DIRECT_BSDF
     uint sampler; // SAMPLER_SOBOL or SAMPLER_RANDOM
+    uint pad; // fills the record
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.
@@ -195,7 +190,8 @@ typedef struct {
     float intensity[3]; // candela or lux
     float cos_outer; // of the cone
     float spot_scale; // 1 / (cos inner - cos outer), floored
-    float pad[3]; // fills the record
+    float area; // m^2, for LIGHT_TRIANGLE
+    float pad[2]; // fills the record
 } Light;
 
 /// A texel of the environment: radiance and its slot of the alias table.

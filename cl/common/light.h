@@ -3,6 +3,7 @@
 
 #include "lanes.h"
 #include "layout.h"
+#include "alpha.h"
 #include "rng.h"
 #include "surface.h"
 
@@ -10,8 +11,8 @@
 typedef struct {
     Vec3 toward;      // from the point to the light, m, not normalised
     Vec3 wi;          // the same, unit
-    Vec3 radiance;    // divided by nothing; per unit of `pdf`
-    Float pdf;        // solid angle, times the chance of the light; of a light without extent, the chance
+    Vec3 radiance;    // arriving; of a light without extent, irradiance across the ray
+    Float pdf;        // per solid angle, times the chance of the light; without extent, the chance
     Mask extended;    // whether a BSDF sample could find this light too
 } LightSample;
 
@@ -113,9 +114,9 @@ LARGE_FUNCTION Vec3 eval_environment(
 
 #if AREA_LIGHTS
 /// Density per solid angle with which sample_light draws a point at distance `t` on an emitter.
-inline Float area_light_density(
-    __global const Light *lights, UInt light, Float t, Float cosine, Float area)
+inline Float area_light_density(__global const Light *lights, UInt light, Float t, Float cosine)
 {
+    const Float area = GATHER(lights, light, area);
     const Float pdf = GATHER(lights, light, pmf) * t * t / max(cosine * area, 1e-30f);
     return pick((cosine > 0.0f) & (area > 0.0f), pdf, (Float)(0.0f));
 }
@@ -176,9 +177,8 @@ LARGE_FUNCTION LightSample sample_light(
         const Float root = sqrt(u1);
         const Float b1 = root * (1.0f - u2);
         const Float b2 = root * u2;
-        const Vec3 cross = cross3(e1, e2);
-        const Vec3 ng = scale(normalize3(cross), GATHER(surfaces, triangle, flip));
-        const Float area = 0.5f * sqrt(dot3(cross, cross));
+        const Vec3 ng = scale(normalize3(cross3(e1, e2)), GATHER(surfaces, triangle, flip));
+        const Float area = GATHER(lights, light, area);
         Vec3 q = add_scaled(add_scaled(p0, e1, b1), e2, b2);
         const Float side = pick(dot3(ng, sub(origin, q)) >= 0.0f, (Float)(1.0f), (Float)(-1.0f));
         const Float extent =
@@ -190,7 +190,11 @@ LARGE_FUNCTION LightSample sample_light(
         const UInt material = GATHER_U(surfaces, triangle, material);
         const Mask two_sided = (GATHER_U(materials, material, flags) & MATERIAL_TWO_SIDED_EMISSION) != 0u;
         const Float cosine = -dot3(ng, wi);
-        const Mask lit = on_triangle & ((cosine > 0.0f) | two_sided) & (area > 0.0f);
+        Mask lit = on_triangle & ((cosine > 0.0f) | two_sided) & (area > 0.0f);
+#if ALPHA
+        // Holes of a cut-out emitter give no light; the shadow ray ends before it could find that out.
+        lit &= alpha_passes_lanes(lit, triangle, b1, b2 ALPHA_ARGUMENTS);
+#endif
         Vec3 emission = vec3(GATHER(materials, material, emission[0]), GATHER(materials, material, emission[1]),
                              GATHER(materials, material, emission[2]));
 #if TEXTURES

@@ -3,9 +3,7 @@
 
 #include "lanes.h"
 #include "layout.h"
-#if TEXTURES
 #include "texture.h"
-#endif
 
 /// A point of a surface, as the BSDF and the lights need it.
 ///
@@ -19,7 +17,6 @@ typedef struct {
     UInt triangle;
     UInt material;
     UInt light;       // NO_LIGHT if it does not emit
-    Float area;       // m^2
 } SurfacePoint;
 
 /// Parameters of the BSDF at a point; textures are already in.
@@ -63,10 +60,7 @@ LARGE_FUNCTION SurfacePoint surface_point(
     s.light = GATHER_U(surfaces, triangle, light);
     s.p = add_scaled(add_scaled(p0, e1, u), e2, v);
 
-    const Vec3 cross = cross3(e1, e2);
-    const Float flip = GATHER(surfaces, triangle, flip);
-    Vec3 ng = scale(normalize3(cross), flip);
-    s.area = 0.5f * sqrt(dot3(cross, cross));
+    const Vec3 ng = scale(normalize3(cross3(e1, e2)), GATHER(surfaces, triangle, flip));
     s.front = dot3(ng, wo) >= 0.0f;
     const Float side = pick(s.front, (Float)(1.0f), (Float)(-1.0f));
     s.ng = scale(ng, side);

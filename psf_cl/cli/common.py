@@ -9,7 +9,7 @@ import time
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 from psf_cl.errors import InputError
-from psf_cl.settings import PRESETS, Settings, resolve
+from psf_cl.settings import AOVS, PRESETS, Settings, resolve
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -40,7 +40,7 @@ def size_argument(text: str) -> tuple[int, int]:
 
 
 def crop_argument(text: str) -> tuple[int, int, int, int]:
-    """Parse ``X,Y,W,H``; whether it lies in the picture is known later."""
+    """Parse ``X,Y,W,H``; ``make_plan`` knows whether it lies in the picture."""
     numbers = _integers(text, text.split(","), 4)
     if numbers is None or min(numbers[:2]) < 0 or min(numbers[2:]) < 1:
         raise argparse.ArgumentTypeError(
@@ -50,7 +50,7 @@ def crop_argument(text: str) -> tuple[int, int, int, int]:
 
 
 def aov_argument(text: str) -> frozenset[str]:
-    """Parse a list of AOV names; ``check_aovs`` knows which there are."""
+    """Parse a list of AOV names; ``make_plan`` knows which there are."""
     return frozenset(part.strip() for part in text.split(","))
 
 
@@ -120,7 +120,7 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="A,B,...",
         type=aov_argument,
         default=frozenset(),
-        help="further channels: albedo, normal, depth, direct, indirect, variance, samples",
+        help=f"further channels: {', '.join(AOVS)}",
     )
 
 
@@ -128,24 +128,14 @@ def load_with_settings(args: argparse.Namespace) -> tuple[Scene, Settings]:
     """Load the scene and combine the settings.
 
     Raises:
-        InputError: anything about them is wrong; also the crop and the names of AOVs.
+        InputError: anything about them is wrong.
     """
-    from psf_cl.image import AOVS
     from psf_cl.scene.load import load_scene
 
-    unknown = sorted(args.aov - AOVS.keys())
-    if unknown:
-        raise InputError(f"--aov: no {unknown[0]!r}; there are: {', '.join(AOVS)}")
     overrides = dict(args.settings)
     if args.seed is not None:
         overrides["seed"] = args.seed
     scene = load_scene(args.scene, environment=args.environment, camera=args.camera, size=args.size)
-    if args.crop is not None:
-        x, y, width, height = args.crop
-        if x + width > scene.width or y + height > scene.height:
-            raise InputError(
-                f"--crop: {x},{y},{width},{height} leaves the picture, {scene.width}x{scene.height}"
-            )
     return scene, resolve(scene.render, scene.path, args.preset, overrides)
 
 

@@ -92,7 +92,8 @@ def difference_picture(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """
     import numpy as np
 
-    from psf_cl.measure.errors import LUMINANCE, mean_luminance
+    from psf_cl.measure.errors import mean_luminance
+    from psf_cl.scene.model import LUMINANCE
 
     if image.shape != reference.shape:
         raise InputError(f"sizes differ: {image.shape[:2]} and {reference.shape[:2]}")

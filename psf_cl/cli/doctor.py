@@ -12,6 +12,7 @@ from typing import Any
 import psf_cl
 from psf_cl.cli.common import show
 from psf_cl.errors import DeviceError
+from psf_cl.settings import DEVICE_VARIABLE
 
 _PACKAGES = ("numpy", "pyopencl", "OpenEXR", "pillow", "rich", "trimesh")
 
@@ -79,8 +80,8 @@ def run(args: argparse.Namespace) -> int:
         if not report.ok:
             print(f"{report.platform}: {report.device}: {report.reason}\n  {fix(report.reason)}")
     usable = sum(report.ok for report in reports)
-    if wanted := os.environ.get("PSF_CL_DEVICE"):
-        print(f"PSF_CL_DEVICE={wanted} limits the choice to devices of that name")
+    if wanted := os.environ.get(DEVICE_VARIABLE):
+        print(f"{DEVICE_VARIABLE}={wanted} limits the choice to devices of that name")
     if not usable:
         print("no OpenCL device can be used")
         print(f"fix: install your GPU's driver, or PoCL for the CPU: {driver}")

@@ -17,6 +17,9 @@ def add_parser(commands: Any) -> None:
         "plan", help="show what a render would run and leave out; needs no OpenCL"
     )
     add_scene_arguments(parser)
+    parser.add_argument(
+        "--kind", choices=("cpu", "gpu"), default="cpu", help="of device to plan for (default cpu)"
+    )
     parser.add_argument("--json", action="store_true", help="print it as JSON")
     parser.set_defaults(run=run)
 
@@ -25,10 +28,11 @@ def run(args: argparse.Namespace) -> int:
     """Print the plan of a scene."""
     from psf_cl.image import json_text
     from psf_cl.plan import make_plan
+    from psf_cl.traits import DeviceTraits
 
     scene, settings = load_with_settings(args)
     tell_notes(scene)
-    plan = make_plan(scene, settings, args.aov, crop=args.crop)
+    plan = make_plan(scene, settings, args.aov, DeviceTraits.of_kind(args.kind), args.crop)
     if args.json:
         print(json_text(plan.as_dict(), indent=2))
     else:

@@ -25,6 +25,7 @@ from psf_cl.cli.common import (
 )
 from psf_cl.cli.progress import ProgressDisplay
 from psf_cl.errors import DeviceError, InputError
+from psf_cl.settings import DEVICE_VARIABLE
 
 if TYPE_CHECKING:
     import numpy as np
@@ -59,7 +60,9 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("--half", action="store_true", help="16-bit floats in the EXR")
     parser.add_argument(
-        "--device", metavar="TEXT", help="part of its name; default: $PSF_CL_DEVICE, or the best"
+        "--device",
+        metavar="TEXT",
+        help=f"part of its name; default: ${DEVICE_VARIABLE}, or the best",
     )
     parser.add_argument(
         "--reference", metavar="REF.exr", help="measure the error against this image"
@@ -73,13 +76,15 @@ def run(args: argparse.Namespace) -> int:
     """Check everything that can be checked, render, write; return 130 if interrupted on the way."""
     from psf_cl.files import check_writable, write_whole
     from psf_cl.image import json_text, output_paths, write_exr, write_png
+    from psf_cl.plan import make_plan
 
     exr, png = output_paths(args.output or f"{Path(args.scene).stem}.exr")
     outputs = [exr, png] + ([Path(args.stats)] if args.stats else [])
-    _check_distinct(outputs, [args.scene, args.reference, args.environment])
     for path in outputs:
         check_writable(path)
     scene, settings = load_with_settings(args)
+    _check_distinct(outputs, [*scene.files, args.reference])
+    make_plan(scene, settings, args.aov, crop=args.crop)  # For its checks, before a device opens.
     reference = _reference(args, scene) if args.reference else None
 
     try:
@@ -95,32 +100,34 @@ def run(args: argparse.Namespace) -> int:
     renderer = Renderer(
         scene, settings, device, outputs=args.aov, crop=args.crop, statistics=statistics
     )
-    with contextlib.closing(renderer):
-        curve = ErrorCurve(reference)
-        with stop_on_interrupt() as interrupted, ProgressDisplay(args.quiet) as display:
+    # Until the files are written, Ctrl-C must not throw the picture away.
+    with stop_on_interrupt() as interrupted:
+        with contextlib.closing(renderer):
+            curve = ErrorCurve(reference)
+            with ProgressDisplay(args.quiet) as display:
 
-            def on_progress(progress: Progress) -> bool:
-                display.update(progress)
-                curve.follow(renderer, progress)
-                return not interrupted()
+                def on_progress(progress: Progress) -> bool:
+                    display.update(progress)
+                    curve.follow(renderer, progress)
+                    return not interrupted()
 
-            spp = None if args.seconds else args.spp or DEFAULT_SPP
-            renderer.render(spp=spp, seconds=args.seconds, progress=on_progress)
-            stopped = interrupted()
-        image = renderer.image()
-        stats = image.stats
-        if not stats["spp"] and not renderer.snapshot(("rgb", "samples")).aovs["samples"].any():
-            raise KeyboardInterrupt
-    if reference is not None:
-        if stats["spp"]:
-            curve.add(stats["render_seconds"], stats["spp"], image.rgb)
-        stats["error"] = curve.points
+                spp = None if args.seconds else args.spp or DEFAULT_SPP
+                renderer.render(spp=spp, seconds=args.seconds, progress=on_progress)
+            image = renderer.image()
+            stats = image.stats
+            if not stats["spp"] and not renderer.snapshot(("rgb", "samples")).aovs["samples"].any():
+                raise KeyboardInterrupt
+        if reference is not None:
+            if stats["spp"]:
+                curve.add(stats["render_seconds"], stats["spp"], image.rgb)
+            stats["error"] = curve.points
 
-    write_exr(exr, image, args.half)
-    write_png(png, image, args.exposure)
-    if args.stats:
-        stats["process_seconds"] = time.perf_counter() - START
-        write_whole(args.stats, (json_text(stats, indent=2) + "\n").encode())
+        write_exr(exr, image, args.half)
+        write_png(png, image, args.exposure)
+        if args.stats:
+            stats["process_seconds"] = time.perf_counter() - START
+            write_whole(args.stats, (json_text(stats, indent=2) + "\n").encode())
+        stopped = interrupted()
     if not args.quiet:
         print(_summary(exr, image))
     if stopped:

@@ -34,7 +34,6 @@ class Bvh:
         depth: levels of nodes, at most 95: each level of the binary tree takes a bit of the code
             (63) or, where codes are equal, of the place (32).
         dropped: triangles that are not in the tree because a coordinate is not finite.
-        build_seconds: wall time of ``build_bvh``.
     """
 
     nodes: Buffer
@@ -43,7 +42,6 @@ class Bvh:
     block_count: int
     depth: int
     dropped: int
-    build_seconds: float
 
     @property
     def stack_size(self) -> int:
@@ -75,7 +73,6 @@ def build_bvh(
     """
     if triangle_count > MOST_TRIANGLES:
         raise ValueError(f"{triangle_count} triangles; a tree takes at most {MOST_TRIANGLES}")
-    start = time.perf_counter()
     build = _Build(device, positions, triangle_count, alpha_flags)
     try:
         build.sort_triangles()
@@ -92,10 +89,22 @@ def build_bvh(
             block_count=build.scalars["block_count"],
             depth=depth,
             dropped=triangle_count - build.scalars["count"],
-            build_seconds=time.perf_counter() - start,
         )
     finally:
         build.release()
+
+
+def warm_up_builder(device: Device) -> float:
+    """Build a small tree, so that all kernels of the builder are ready; return the seconds."""
+    start = time.perf_counter()
+    corners = np.arange(9 * 64, dtype=np.float32) % 7.0
+    positions = device.upload("positions", corners)
+    try:
+        tree = build_bvh(device, positions, 64)
+        device.release(tree.nodes, tree.blocks)
+    finally:
+        device.release(positions)
+    return time.perf_counter() - start
 
 
 class _Build:

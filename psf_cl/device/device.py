@@ -1,8 +1,10 @@
-"""Device: one OpenCL device with its queue and memory; the only copies and the only wait."""
+"""Device: one OpenCL device with its queue and memory; all copies and waits of a render."""
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -70,6 +72,10 @@ class Device:
         return f"{self.cl_device.platform.name}: {self.cl_device.name}".strip()
 
     @property
+    def memory_bytes(self) -> int:
+        return self.cl_device.global_mem_size
+
+    @property
     def driver(self) -> str:
         return f"{self.cl_device.platform.version} / {self.cl_device.driver_version}".strip()
 
@@ -88,14 +94,10 @@ class Device:
                 f"{name} needs {size / 2**20:.0f} MiB; "
                 f"{self.name} allows {limit / 2**20:.0f} MiB in one buffer"
             )
-        try:
+        with self.failures(f"allocating {size / 2**20:.0f} MiB for {name}"):
             memory = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, size)
             # A pattern of one byte divides every size.
             cl.enqueue_fill_buffer(self.queue, memory, np.uint8(0), 0, size)
-        except (cl.MemoryError, cl.RuntimeError, cl.LogicError) as error:
-            raise DeviceError(
-                f"{name}: {size / 2**20:.0f} MiB refused by {self.name}: {error}"
-            ) from error
         self.allocated_bytes += size
         self.peak_bytes = max(self.peak_bytes, self.allocated_bytes)
         return Buffer(name, dtype, count, memory)
@@ -116,9 +118,10 @@ class Device:
                 f"{buffer.count} of {buffer.dtype}"
             )
         if array.size:
-            cl.enqueue_copy(
-                self.queue, buffer.memory, array, dst_offset=offset * buffer.dtype.itemsize
-            )
+            with self.failures(f"writing {buffer.name}"):
+                cl.enqueue_copy(
+                    self.queue, buffer.memory, array, dst_offset=offset * buffer.dtype.itemsize
+                )
 
     def read(self, buffer: Buffer, count: int | None = None, offset: int = 0) -> np.ndarray:
         """Return items of ``buffer`` after all queued work is done."""
@@ -127,22 +130,16 @@ class Device:
             raise ValueError(f"{buffer.name}: {count} items at {offset} of {buffer.count}")
         array = np.empty(count, buffer.dtype)
         if count:
-            cl.enqueue_copy(
-                self.queue, array, buffer.memory, src_offset=offset * buffer.dtype.itemsize
-            )
+            with self.failures(f"reading {buffer.name}"):
+                cl.enqueue_copy(
+                    self.queue, array, buffer.memory, src_offset=offset * buffer.dtype.itemsize
+                )
         return array
-
-    def copy(self, source: Buffer, target: Buffer, count: int) -> None:
-        """Enqueue a copy of the first ``count`` items."""
-        size = count * source.dtype.itemsize
-        if size > min(source.bytes, target.bytes):
-            raise ValueError(f"{source.name} to {target.name}: {count} items are too many")
-        if size:
-            cl.enqueue_copy(self.queue, target.memory, source.memory, byte_count=size)
 
     def fill(self, buffer: Buffer, byte: int = 0) -> None:
         """Enqueue setting every byte of ``buffer``."""
-        cl.enqueue_fill_buffer(self.queue, buffer.memory, np.uint8(byte), 0, buffer.bytes)
+        with self.failures(f"filling {buffer.name}"):
+            cl.enqueue_fill_buffer(self.queue, buffer.memory, np.uint8(byte), 0, buffer.bytes)
 
     def release(self, *buffers: Buffer) -> None:
         """Give buffers back; using one afterwards is an error."""
@@ -150,25 +147,25 @@ class Device:
             self.allocated_bytes -= buffer.bytes
             buffer.release()
 
-    def mark(self) -> cl.Event:
-        """Return an event that is done when all work queued so far is; starts that work."""
-        event = cl.enqueue_marker(self.queue)
-        self.queue.flush()
-        return event
-
-    def wait(self, event: cl.Event | None = None) -> None:
-        """Wait for ``event``, or for everything queued.  The one place where the host waits.
+    def wait(self) -> None:
+        """Wait for everything queued.
 
         Raises:
             DeviceError: the device failed while it worked.
         """
+        with self.failures("waiting"):
+            self.queue.finish()
+
+    @contextlib.contextmanager
+    def failures(self, what: str) -> Iterator[None]:
+        """Turn the driver's errors into a DeviceError that says ``what`` was being done.
+
+        Drivers may report what went wrong at any later call: all calls are made in here.
+        """
         try:
-            if event is None:
-                self.queue.finish()
-            else:
-                event.wait()
+            yield
         except cl.Error as error:
-            raise DeviceError(f"{self.name} failed: {error}") from error
+            raise DeviceError(f"{self.name} failed at {what}: {error}") from error
 
     def collect_events(self) -> None:
         """Add the events of finished launches to ``totals``; call after everything is done."""
@@ -196,6 +193,13 @@ def list_devices() -> list[cl.Device]:
         except cl.Error:  # A platform without a device reports an error; others may have one.
             continue
     return devices
+
+
+def _rank(device: cl.Device) -> int:
+    # Types are bits: a device may also be the platform's default.
+    if device.type & cl.device_type.GPU:
+        return 0
+    return 1 if device.type & cl.device_type.ACCELERATOR else 2
 
 
 def open_device(
@@ -226,8 +230,7 @@ def open_device(
                 f"{source}: no device matches {text!r}; there are: {'; '.join(names) or 'none'}"
             )
         devices = chosen
-    rank = {cl.device_type.GPU: 0, cl.device_type.ACCELERATOR: 1}
-    devices.sort(key=lambda device: rank.get(device.type, 2))
+    devices.sort(key=_rank)
     failures = []
     for device in devices:
         try:

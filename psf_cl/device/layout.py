@@ -67,9 +67,6 @@ PARAMS = Record(
     float film_scale_y - tangent of half the vertical field of view
     uint width - pixels of the whole film
     uint height - pixels of the whole film
-    uint crop_x - first column that is rendered
-    uint crop_y - first row that is rendered
-    uint crop_width - columns that are rendered
     uint pixel_count - pixels that are rendered
     uint ring - passes that may be in flight
     uint slots - paths of the pool
@@ -77,8 +74,6 @@ PARAMS = Record(
     uint max_depth - bounces
     uint roulette_depth - bounces before roulette
     uint light_count - entries of the light table
-    uint triangle_count - entries of the triangle tables
-    uint material_count - entries of the material table
     uint environment_width - texels
     uint environment_height - texels
     float environment_radiance[3] - constant sky, or factor of the image
@@ -87,6 +82,7 @@ PARAMS = Record(
     float scene_radius - m, of the bounding sphere
     uint direct_sampling - DIRECT_MIS, DIRECT_LIGHT or DIRECT_BSDF
     uint sampler - SAMPLER_SOBOL or SAMPLER_RANDOM
+    uint pad - fills the record
     """),
 )
 
@@ -191,7 +187,8 @@ LIGHT = Record(
     float intensity[3] - candela or lux
     float cos_outer - of the cone
     float spot_scale - 1 / (cos inner - cos outer), floored
-    float pad[3] - fills the record
+    float area - m^2, for LIGHT_TRIANGLE
+    float pad[2] - fills the record
     """),
 )
 
@@ -287,7 +284,6 @@ COUNTERS = (
     ("pending_camera", "rays since the last film launch"),
     ("pending_bounce", ""),
     ("pending_shadow", ""),
-    ("stack_overflows", "traversal stacks that were full"),
     ("finished", "first of the ring: samples done of each pass in flight"),
 )
 

@@ -32,6 +32,7 @@ _BUILD_OPTIONS = ("-cl-std=CL1.2", "-cl-kernel-arg-info")
 def assemble(file: str, folder: Path | None = None) -> str:
     """Return the text of ``file`` with every ``#include "x"`` expanded once.
 
+    An include inside an ``#if`` is refused: the one place where it is expanded might be cut away.
     Drivers cache by source text, so the text has to hold all that it depends on; ``#line`` at each
     seam makes build errors name the real file and line.
     """
@@ -43,8 +44,12 @@ def assemble(file: str, folder: Path | None = None) -> str:
         inside = path.is_relative_to(folder)
         shown = f"cl/{path.relative_to(folder).as_posix()}" if inside else path.name
         lines = [f'#line 1 "{shown}"']
+        conditions = 0
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+            conditions += bool(re.match(r"\s*#\s*if", line)) - bool(re.match(r"\s*#\s*endif", line))
             match = _INCLUDE.match(line)
+            if match and conditions:
+                raise DeviceError(f"{shown}:{number}: an include inside a condition")
             if match is None:
                 # Includes are expanded once anyway; compilers warn of the pragma in a main file.
                 lines.append("" if line.strip() == "#pragma once" else line)
@@ -93,16 +98,17 @@ class Program:
         and waits for it, so that another thread can go on with the device's.
         """
         device = self.device
-        queue = cl.CommandQueue(device.context)
-        zeros = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, _WARM_UP_BYTES)
-        cl.enqueue_fill_buffer(queue, zeros, np.uint8(0), 0, _WARM_UP_BYTES)
-        for name in kernels:
-            kernel = cl.Kernel(self.program, name)
-            for index, (_, spelled, pointer) in enumerate(parameters_of(kernel)):
-                kernel.set_arg(index, zeros if pointer else _SCALARS[spelled](0))
-            group = device.traits.group
-            cl.enqueue_nd_range_kernel(queue, kernel, (group,), (group,))
-        queue.finish()
+        with device.failures(f"warming up {self.file}"):
+            queue = cl.CommandQueue(device.context)
+            zeros = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, _WARM_UP_BYTES)
+            cl.enqueue_fill_buffer(queue, zeros, np.uint8(0), 0, _WARM_UP_BYTES)
+            for name in kernels:
+                kernel = cl.Kernel(self.program, name)
+                for index, (_, spelled, pointer) in enumerate(parameters_of(kernel)):
+                    kernel.set_arg(index, zeros if pointer else _SCALARS[spelled](0))
+                group = device.traits.group
+                cl.enqueue_nd_range_kernel(queue, kernel, (group,), (group,))
+            queue.finish()
 
     def bind(self, kernel: str, **arguments: Buffer | int | float | np.generic) -> Launch:
         """Return a launch of ``kernel`` with its arguments set by name.
@@ -223,7 +229,8 @@ class Launch:
             return
         group = group or self.device.traits.group
         padded = -(-items // group) * group
-        event = cl.enqueue_nd_range_kernel(self.device.queue, self.kernel, (padded,), (group,))
+        with self.device.failures(self.label):
+            event = cl.enqueue_nd_range_kernel(self.device.queue, self.kernel, (padded,), (group,))
         if self.device.profiling:
             self.device.events.append((self.name, items, event))
 

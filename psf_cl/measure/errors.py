@@ -9,9 +9,7 @@ import numpy as np
 
 from psf_cl.errors import InputError
 from psf_cl.image import Image
-
-# Rec.709 luminance of linear RGB, ITU-R BT.709-6 section 3.
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+from psf_cl.scene.model import LUMINANCE
 
 # Keeps the relative error finite in black pixels; in units of the mean luminance, squared.
 _RELATIVE_FLOOR = 0.01

@@ -10,6 +10,7 @@ import numpy as np
 from psf_cl.errors import InputError
 from psf_cl.files import read_file
 from psf_cl.image import read_exr
+from psf_cl.scene.model import MAX_RADIANCE
 
 SUFFIXES = (".exr", ".hdr")
 MAX_PIXELS = 1 << 27
@@ -20,7 +21,8 @@ def load_environment(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
 
     Returns:
         ``(height, width, 3)`` float32, linear Rec.709, finite, not negative; row 0 is the zenith.
-        Negative and NaN texels become 0, infinite ones the largest finite value of the image.
+        Negative and NaN texels become 0, infinite ones the largest finite value of the image, but
+        none is above ``MAX_RADIANCE``.
 
     Raises:
         InputError: missing or broken file, no colour channels, or more than ``MAX_PIXELS``.
@@ -39,11 +41,16 @@ def load_environment(path: Path) -> tuple[np.ndarray, tuple[str, ...]]:
 def _mended(path: Path, radiance: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
     infinite = np.isposinf(radiance)
     dark = ~(radiance >= 0)
-    if not (infinite.any() or dark.any()):
+    extreme = np.isfinite(radiance) & (radiance > MAX_RADIANCE)
+    if not (infinite.any() or dark.any() or extreme.any()):
         return radiance, ()
     notes = []
     if dark.any():
         notes.append(f"{path}: {dark.any(axis=-1).sum()} negative or NaN texels are set to 0.")
+    if extreme.any():
+        count = extreme.any(axis=-1).sum()
+        notes.append(f"{path}: {count} texels above {MAX_RADIANCE:g} are set to that.")
+        radiance = np.where(extreme, np.float32(MAX_RADIANCE), radiance)
     if infinite.any():
         finite = radiance[np.isfinite(radiance)]
         brightest = max(float(finite.max(initial=0.0)), 1.0)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import reprlib
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -26,7 +27,18 @@ from psf_cl.scene.gltf_file import (
     MissingData,
     open_gltf,
 )
-from psf_cl.scene.model import Camera, Light, Material, Mesh, Scene, Shape, Texture
+from psf_cl.scene.model import (
+    MAX_RADIANCE,
+    MAX_TRIANGLES,
+    Camera,
+    Light,
+    Material,
+    Mesh,
+    Scene,
+    Shape,
+    Texture,
+    limited,
+)
 from psf_cl.scene.texture import decode_pixels
 from psf_cl.scene.transform import rotation_quaternion, without_scale
 
@@ -86,6 +98,7 @@ class _Reader:
     pixels: dict[int, np.ndarray] = field(default_factory=dict)
     meshes: dict[int, list[tuple[Mesh, int | None]]] = field(default_factory=dict)
     aspect: float | None = None
+    triangle_count: int = 0
 
     def scene(self, path: str) -> Scene:
         """Read all nodes of the default scene."""
@@ -119,7 +132,14 @@ class _Reader:
                 text if count == 1 else f"{text} ({count} times)"
                 for text, count in self.notes.items()
             ),
+            files=(path, *self.gltf.files),
         )
+
+    def _limited(self, radiance: Iterable[float]) -> tuple[float, float, float]:
+        radiance = tuple(radiance)
+        if max(radiance) > MAX_RADIANCE:
+            self.notes[f"radiance and intensity above {MAX_RADIANCE:g} are set to that"] += 1
+        return limited(radiance)
 
     def _drawn_nodes(self, children: list[list[int]], parents: list[int]) -> list[int]:
         """Return the nodes below the roots of the default scene, parents first."""
@@ -218,7 +238,7 @@ class _Reader:
         self.lights.append(
             Light(
                 kind,
-                tuple(intensity * channel for channel in color),
+                self._limited(intensity * channel for channel in color),
                 light.text("name", ""),
                 position=tuple(transform[:3, 3].tolist()),
                 direction=tuple(direction.tolist()),
@@ -253,6 +273,10 @@ class _Reader:
                 self.notes["primitives whose buffer has no data are left out"] += 1
                 continue
             if mesh is not None:
+                # Each takes memory, however few bytes of the file many of them share.
+                self.triangle_count += len(mesh.triangles)
+                if self.triangle_count > MAX_TRIANGLES:
+                    primitive.fail("indices", f"at most {MAX_TRIANGLES} triangles in all meshes")
                 meshes.append((mesh, self.gltf.index(primitive, "material", "materials")))
         return meshes
 
@@ -390,7 +414,7 @@ class _Reader:
             specular=specular.number("specularFactor", 1.0, 0.0, 1.0),
             ior=ior,
             transmission=transmission.number("transmissionFactor", 0.0, 0.0, 1.0),
-            emission=tuple(channel * strength for channel in emission),
+            emission=self._limited(channel * strength for channel in emission),
             emission_texture=self._texture(item, "emissiveTexture") if any(emission) else -1,
             double_sided=item.flag("doubleSided"),
         )

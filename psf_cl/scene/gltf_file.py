@@ -27,7 +27,8 @@ from psf_cl.files import read_file
 # JSON numbers end up in float32 on the device.
 MAX_NUMBER = float(np.finfo(np.float32).max)
 
-# An accessor without a buffer view is all zeros: no file size bounds its count, only this.
+# An accessor without a buffer view is all zeros: no file size bounds the count, only this, which is
+# for all of them together.
 MAX_ZEROS = 1 << 24
 
 _COMPONENTS = {
@@ -173,13 +174,16 @@ class GltfFile:
         root: the whole JSON.
         folder: where relative URIs start; nothing outside it is read.
         binary: the BIN chunk of a .glb, else None.
+        files: those that were read besides the file itself.
     """
 
     root: Item
     folder: Path
     binary: memoryview | None
+    files: list[str] = field(default_factory=list)
     _buffers: dict[int, memoryview] = field(default_factory=dict)
     _accessors: dict[tuple[int, bool], np.ndarray] = field(default_factory=dict)
+    _zeros: int = 0
 
     def index(self, owner: Item, key: str, array: str) -> int | None:
         """Return ``owner[key]``, an index into the root's list ``array``, or None if absent."""
@@ -238,9 +242,11 @@ class GltfFile:
         if not inside or _SCHEME.match(uri):
             owner.fail("uri", "a relative path that stays inside the folder of the file")
         try:
-            return read_file(path)
+            data = read_file(path)
         except InputError as error:
             raise InputError(f"{owner.file}: {owner.path_of('uri')}: {error}") from None
+        self.files.append(str(path))
+        return data
 
     def accessor(
         self,
@@ -298,8 +304,9 @@ class GltfFile:
         count = item.integer("count", low=1)
         view_index = self.index(item, "bufferView", "bufferViews")
         if view_index is None:
-            if count > MAX_ZEROS:
-                item.fail("count", f"at most {MAX_ZEROS} without a bufferView")
+            self._zeros += count
+            if self._zeros > MAX_ZEROS:
+                item.fail("count", f"at most {MAX_ZEROS} in all accessors without a bufferView")
             stored = np.zeros((count, elements), component)
         else:
             stride = self.root.element("bufferViews", view_index).integer("byteStride", 0)

@@ -12,7 +12,18 @@ from psf_cl.errors import InputError
 from psf_cl.scene import mesh, transform
 from psf_cl.scene.environment import load_environment
 from psf_cl.scene.gltf import load_gltf
-from psf_cl.scene.model import Camera, Environment, Scene, Shape
+from psf_cl.scene.model import (
+    MAX_TRIANGLES,
+    Camera,
+    Environment,
+    Material,
+    Mesh,
+    Scene,
+    emits,
+    has_environment,
+    is_invisible,
+    shines,
+)
 from psf_cl.scene.toml_file import MAX_SIZE, load_toml
 
 DEFAULT_FOV_Y = math.radians(45)
@@ -40,17 +51,23 @@ def load_scene(
         size: width and height in pixels instead of the scene's.
 
     Raises:
-        InputError: missing, unknown or malformed file, no triangles, no camera of that name, or a
-            size out of range.
+        InputError: missing, unknown or malformed file, no triangles or too many, no camera of that
+            name, or a size out of range.
     """
     path = Path(path)
     scene = load_toml(path, _load_mesh_file) if _suffix(path) == ".toml" else _load_mesh_file(path)
-    if not any(len(shape.mesh.triangles) for shape in scene.shapes):
+    count = sum(len(shape.mesh.triangles) for shape in scene.shapes)
+    if count == 0:
         raise InputError(f"{path} has no triangles")
+    if count > MAX_TRIANGLES:
+        raise InputError(f"{path}: expected at most {MAX_TRIANGLES} triangles; got {count}")
     if environment is not None:
         image, notes = load_environment(Path(environment))
         scene = replace(
-            scene, environment=Environment((1.0, 1.0, 1.0), image), notes=scene.notes + notes
+            scene,
+            environment=Environment((1.0, 1.0, 1.0), image),
+            notes=scene.notes + notes,
+            files=(*scene.files, str(environment)),
         )
     return _without_unused(_with_light(_with_camera(_with_size(scene, size), camera)))
 
@@ -97,11 +114,19 @@ def framing_camera(scene: Scene) -> Camera:
     Raises:
         InputError: no vertex of a triangle is finite.
     """
-    bounds = [corners for shape in scene.shapes if (corners := _bounds(shape)) is not None]
-    if not bounds:
+    boxes: dict[int, np.ndarray] = {}  # Many shapes may share one large mesh.
+    for shape in scene.shapes:
+        if id(shape.mesh) not in boxes:
+            boxes[id(shape.mesh)] = _box_corners(shape.mesh)
+    corners = np.concatenate(
+        [
+            transform.transform_points(shape.transform, boxes[id(shape.mesh)])
+            for shape in scene.shapes
+        ]
+    )
+    if not len(corners):
         raise InputError(f"{scene.path} has no triangles with finite vertices")
-    low = np.min([corners[0] for corners in bounds], axis=0)
-    high = np.max([corners[1] for corners in bounds], axis=0)
+    low, high = corners.min(axis=0), corners.max(axis=0)
     center = (low + high) / 2
     # A single point still needs a distance, and one that float32 can tell from its position.
     radius = max(float(np.linalg.norm(high - low)) / 2, 1e-4 * float(np.abs(center).max()), 1e-6)
@@ -113,45 +138,46 @@ def framing_camera(scene: Scene) -> Camera:
     return Camera(view, DEFAULT_FOV_Y, focus_distance=distance)
 
 
-def _bounds(shape: Shape) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the least and greatest world coordinates of the vertices that triangles use."""
-    used = np.zeros(len(shape.mesh.positions), bool)
-    used[shape.mesh.triangles.reshape(-1)] = True
-    used &= np.isfinite(shape.mesh.positions).all(axis=1)
-    points = transform.transform_points(shape.transform, shape.mesh.positions[used])
-    return (points.min(axis=0), points.max(axis=0)) if len(points) else None
+def _box_corners(mesh: Mesh) -> np.ndarray:
+    """Return the box around the finite vertices that triangles use, ``(8, 3)``, or ``(0, 3)``."""
+    used = np.zeros(len(mesh.positions), bool)
+    used[mesh.triangles.reshape(-1)] = True
+    points = mesh.positions[used & np.isfinite(mesh.positions).all(axis=1)]
+    if not len(points):
+        return np.zeros((0, 3))
+    ends = np.stack([points.min(axis=0), points.max(axis=0)]).astype(np.float64)
+    return ends[np.indices((2, 2, 2)).reshape(3, 8).T, np.arange(3)]
 
 
 def _with_light(scene: Scene) -> Scene:
-    sky = scene.environment
-    emitting = any(any(scene.materials[shape.material].emission) for shape in scene.shapes)
-    shining = any(any(light.intensity) for light in scene.lights)
-    glowing = any(sky.radiance) and (sky.image is None or bool(np.any(sky.image)))
-    if emitting or shining or glowing:
+    used = [scene.materials[index] for index in {shape.material for shape in scene.shapes}]
+    emitting = any(emits(material) and not is_invisible(material) for material in used)
+    if emitting or any(map(shines, scene.lights)) or has_environment(scene.environment):
         return scene
     note = "The scene has no light: a sky of constant radiance (1, 1, 1) is added."
     return replace(scene, environment=Environment(DEFAULT_SKY), notes=(*scene.notes, note))
 
 
 def _without_unused(scene: Scene) -> Scene:
-    """Return the scene without materials that no shape has and textures that no material has."""
+    """Return the scene without materials that no shape has and textures that nothing looks up."""
     kept = sorted({shape.material for shape in scene.shapes})
+    materials = [_without_dark_texture(scene.materials[index]) for index in kept]
     fields = ("base_color_texture", "emission_texture")
-    textures = {getattr(scene.materials[index], name) for index in kept for name in fields}
-    order = sorted(textures - {-1})
+    order = sorted({getattr(material, name) for material in materials for name in fields} - {-1})
     new_texture = {-1: -1} | {old: new for new, old in enumerate(order)}
     new_material = {old: new for new, old in enumerate(kept)}
     return replace(
         scene,
         textures=tuple(scene.textures[index] for index in order),
         materials=tuple(
-            replace(
-                scene.materials[index],
-                **{name: new_texture[getattr(scene.materials[index], name)] for name in fields},
-            )
-            for index in kept
+            replace(material, **{name: new_texture[getattr(material, name)] for name in fields})
+            for material in materials
         ),
         shapes=tuple(
             replace(shape, material=new_material[shape.material]) for shape in scene.shapes
         ),
     )
+
+
+def _without_dark_texture(material: Material) -> Material:
+    return material if emits(material) else replace(material, emission_texture=-1)

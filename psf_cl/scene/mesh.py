@@ -22,7 +22,7 @@ import numpy as np
 
 from psf_cl.errors import InputError
 from psf_cl.files import read_file
-from psf_cl.scene.model import Material, Mesh, Scene, Shape, Texture
+from psf_cl.scene.model import MAX_RADIANCE, Material, Mesh, Scene, Shape, Texture, limited
 from psf_cl.scene.texture import load_texture
 
 SUFFIXES = (".obj", ".ply", ".stl")
@@ -79,6 +79,7 @@ def _load_ply(path: Path, data: bytes) -> Scene:
         materials=(material,),
         textures=tuple(textures),
         notes=tuple(f"Left out: {reason}." for reason in lost),
+        files=(str(path), *_texture_files(path, textures)),
     )
 
 
@@ -94,7 +95,7 @@ def _load_stl(path: Path, data: bytes) -> Scene:
         raise InputError(f"{path}: neither ASCII STL nor binary STL of the length in its header")
     # A file with several solids has a table of meshes, any other is the mesh itself.
     parts = read.get("geometry", {"": read}).values()
-    return Scene(path=str(path), shapes=_shapes(path, parts))
+    return Scene(path=str(path), shapes=_shapes(path, parts), files=(str(path),))
 
 
 def _shapes(path: Path, parts: Iterable[dict[str, Any]]) -> tuple[Shape, ...]:
@@ -197,7 +198,8 @@ def _load_obj(path: Path, data: bytes) -> Scene:
 
     notes: list[str] = []
     textures: list[Texture] = []
-    known = _read_libraries(path, libraries, textures, notes)
+    files = [str(path)]
+    known = _read_libraries(path, libraries, textures, notes, files)
     materials: dict[str, Material] = {}
     shapes = []
     unknown: list[str] = []
@@ -219,7 +221,12 @@ def _load_obj(path: Path, data: bytes) -> Scene:
         materials=tuple(materials.values()) or (Material(),),
         textures=tuple(textures),
         notes=tuple(notes),
+        files=(*files, *_texture_files(path, textures)),
     )
+
+
+def _texture_files(path: Path, textures: list[Texture]) -> list[str]:
+    return [str(path.parent / texture.name) for texture in textures]
 
 
 def _listed(items: list[str]) -> str:
@@ -287,9 +294,9 @@ def _absolute_corner(corner: str, seen: list[int]) -> list[str] | None:
 
 
 def _read_libraries(
-    path: Path, libraries: list[str], textures: list[Texture], notes: list[str]
+    path: Path, libraries: list[str], textures: list[Texture], notes: list[str], files: list[str]
 ) -> dict[str, Material]:
-    """Return the materials of all ``mtllib`` lines; fill ``textures`` and ``notes``."""
+    """Return the materials of all ``mtllib`` lines; fill the other lists with what was met."""
     known: dict[str, Material] = {}
     lost_textures: list[str] = []
     for library in libraries:
@@ -301,16 +308,21 @@ def _read_libraries(
             except InputError as error:
                 notes.append(f"Materials are left out: {error}.")
                 continue
-            known |= _parse_mtl(path, text, textures, lost_textures)
+            files.append(str(path.parent / name))
+            known |= _parse_mtl(path, text, textures, lost_textures, notes)
     if lost_textures:
         notes.append(f"{path}: textures are left out: {_listed(lost_textures)}.")
     return known
 
 
 def _parse_mtl(
-    path: Path, text: str, textures: list[Texture], lost_textures: list[str]
+    path: Path, text: str, textures: list[Texture], lost_textures: list[str], notes: list[str]
 ) -> dict[str, Material]:
-    """Return the materials of an MTL file: ``Kd``, ``Ke``, ``map_Kd``; the rest is passed over."""
+    """Return the materials of an MTL file: ``Kd``, ``Ke``, ``map_Kd``; the rest is passed over.
+
+    Raises:
+        InputError: a colour is not finite.
+    """
     known: dict[str, Material] = {}
     name = ""
     for line in text.splitlines():
@@ -323,10 +335,16 @@ def _parse_mtl(
             color = _color(rest)
             if color is None:
                 continue
+            if not all(map(math.isfinite, color)):
+                raise InputError(
+                    f"{path}: material {name}: {keyword}: expected finite numbers; got {rest[:60]}"
+                )
             if keyword == "Kd":
                 known[name] = replace(known[name], base_color=tuple(min(c, 1.0) for c in color))
-            else:
-                known[name] = replace(known[name], emission=color)
+                continue
+            known[name] = replace(known[name], emission=limited(color))
+            if max(color) > MAX_RADIANCE:
+                notes.append(f"{path}: Ke of {name} above {MAX_RADIANCE:g} is set to that.")
         elif name and keyword == "map_Kd" and rest:
             index = _texture_index(path, rest, textures, lost_textures)
             known[name] = replace(known[name], base_color_texture=index)
@@ -334,14 +352,14 @@ def _parse_mtl(
 
 
 def _color(text: str) -> tuple[float, float, float] | None:
-    """Return the RGB of ``r g b`` or ``r``; None unless it is finite and not negative."""
+    """Return the RGB of ``r g b`` or ``r``; None if it is malformed or negative."""
     try:
         values = [float(word) for word in text.split()[:3]]
     except ValueError:
         return None
     if len(values) == 1:
         values *= 3
-    if len(values) != 3 or not all(math.isfinite(value) and value >= 0 for value in values):
+    if len(values) != 3 or any(value < 0 for value in values):
         return None
     return values[0], values[1], values[2]
 

@@ -6,10 +6,21 @@ Every reader (TOML, glTF, OBJ, PLY, STL) fills these records and nothing else.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+
+#: Triangles that a scene may have.  A file's size does not bound them: one mesh has many places.
+MAX_TRIANGLES = 1 << 27
+
+#: The greatest radiance, candela and lux: what is multiplied with it stays a float32.
+MAX_RADIANCE = 1e20
+
+#: Relative luminance of linear Rec.709, by component (ITU-R BT.709-6 section 3).
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+LUMINANCE.setflags(write=False)
 
 
 @dataclass(frozen=True)
@@ -165,6 +176,7 @@ class Scene:
         camera: index into ``cameras`` of the one to use unless another is asked for.
         render: the ``[render]`` table, unchecked (``settings.resolve`` checks it).
         notes: what the reader assumed or left out, one sentence each, to be told to the user.
+        files: every file that was read for it.
     """
 
     path: str
@@ -179,3 +191,41 @@ class Scene:
     environment: Environment = Environment()
     render: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    files: tuple[str, ...] = ()
+
+
+def limited(radiance: Iterable[float]) -> tuple[float, float, float]:
+    """Return an RGB triple with no component above ``MAX_RADIANCE``."""
+    red, green, blue = (min(float(value), MAX_RADIANCE) for value in radiance)
+    return red, green, blue
+
+
+def emits(material: Material) -> bool:
+    """Return whether ``material`` is a light."""
+    return max(material.emission) > 0.0
+
+
+def is_cut_out(material: Material) -> bool:
+    """Return whether hits on ``material`` must look up its alpha."""
+    return material.alpha_mode == "mask" and material.base_color_texture >= 0
+
+
+def is_invisible(material: Material) -> bool:
+    """Return whether ``material`` is cut out everywhere: its shapes are not there."""
+    return (
+        material.alpha_mode == "mask"
+        and material.base_color_texture < 0
+        and material.alpha < material.alpha_cutoff
+    )
+
+
+def shines(light: Light) -> bool:
+    """Return whether ``light`` gives any light."""
+    return max(light.intensity) > 0.0
+
+
+def has_environment(environment: Environment) -> bool:
+    """Return whether any light comes from infinitely far away."""
+    if max(environment.radiance) <= 0.0:
+        return False
+    return environment.image is None or bool((environment.image > 0.0).any())

@@ -13,9 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from psf_cl.errors import InputError
-
-_SHOWN = 60
+from psf_cl.errors import InputError, shown
 
 
 @dataclass(frozen=True)
@@ -27,8 +25,8 @@ class Place:
 
     def key(self, name: str) -> Place:
         """Return the place of ``name`` inside this table."""
-        shown = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else repr(name)
-        return Place(self.source, f"{self.path}.{shown}" if self.path else shown)
+        spelled = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else repr(name)
+        return Place(self.source, f"{self.path}.{spelled}" if self.path else spelled)
 
     def item(self, index: int) -> Place:
         """Return the place of element ``index`` of this array."""
@@ -72,7 +70,7 @@ def read_table(table: Any, schema: Schema, place: Place) -> dict[str, Any]:
         InputError: not a table, an unknown key, a value of another kind, or a required key missing.
     """
     if not isinstance(table, dict):
-        raise place.error(f"expected a table; got {_shown(table)}")
+        raise place.error(f"expected a table; got {shown(table)}")
     for name in table:
         if name not in schema:
             close = difflib.get_close_matches(name, schema, n=1)
@@ -88,21 +86,11 @@ def _read(key: Key, value: Any, place: Place) -> Any:
     try:
         return key.kind.read(value)
     except ValueError:
-        raise place.error(f"expected {_described(key)}; got {_shown(value)}") from None
+        raise place.error(f"expected {_described(key)}; got {shown(value)}") from None
 
 
 def _described(key: Key) -> str:
     return f"{key.kind.expects} ({key.doc})" if key.doc else key.kind.expects
-
-
-def _shown(value: Any) -> str:
-    if isinstance(value, dict):
-        return "a table"
-    try:
-        text = repr(value)
-    except ValueError:  # Python refuses to print integers of more than 4,300 digits
-        return "a huge integer"
-    return text if len(text) <= _SHOWN else text[: _SHOWN - 3] + "..."
 
 
 def number(low: float = -math.inf, high: float = math.inf, *, above: float = -math.inf) -> Kind:

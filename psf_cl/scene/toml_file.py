@@ -21,7 +21,17 @@ from psf_cl.errors import InputError
 from psf_cl.files import read_file
 from psf_cl.scene import transform
 from psf_cl.scene.environment import load_environment
-from psf_cl.scene.model import Camera, Environment, Light, Material, Mesh, Scene, Shape, Texture
+from psf_cl.scene.model import (
+    MAX_RADIANCE,
+    Camera,
+    Environment,
+    Light,
+    Material,
+    Mesh,
+    Scene,
+    Shape,
+    Texture,
+)
 from psf_cl.scene.primitives import PRIMITIVES
 from psf_cl.scene.schema import (
     Key,
@@ -42,8 +52,6 @@ from psf_cl.scene.schema import (
 from psf_cl.scene.texture import load_texture
 
 MAX_SIZE = 16384
-# Radiance beyond this would leave float32 in a product or two.
-MAX_RADIANCE = 1e20
 MAX_LENGTH = 1e18
 
 _POINT = vector(3, -MAX_LENGTH, MAX_LENGTH)
@@ -185,6 +193,7 @@ def load_toml(path: Path, load_mesh_file: Callable[[Path], Scene]) -> Scene:
         environment=environment,
         render=raw.get("render", {}),
         notes=tuple(assembly.notes),
+        files=(str(path), *assembly.read_files),
     )
 
 
@@ -206,6 +215,7 @@ class _Assembly:
         overrides: by material name, the fields that ``[materials.NAME]`` sets.
         own: by material name, the index of the material made of those fields alone.
         files: by path, a mesh file's scene and the indices of its materials in this scene.
+        read_files: the path of every file read.
         emitters: copies of materials made for ``emission`` on a shape, by what they copy.
     """
 
@@ -221,6 +231,7 @@ class _Assembly:
     used_overrides: set[str] = field(default_factory=set)
     own: dict[str, int] = field(default_factory=dict)
     files: dict[str, tuple[Scene, list[int]]] = field(default_factory=dict)
+    read_files: list[str] = field(default_factory=list)
     texture_indices: dict[str, int] = field(default_factory=dict)
     emitters: dict[tuple[int, Material], int] = field(default_factory=dict)
     primitives: dict[str, Mesh] = field(default_factory=dict)
@@ -236,6 +247,7 @@ class _Assembly:
             raise place.error(f"expected a file; {path} is a folder")
         if not os.path.isfile(path):
             raise place.error(f"no such file: {path}")
+        self.read_files.append(str(path))
         return path
 
     def add_material(self, material: Material) -> int:
@@ -287,6 +299,7 @@ class _Assembly:
                     self.used_overrides.add(material.name)
                 indices.append(self.add_material(replace(material, **(shifted | changes))))
             self.notes.extend(scene.notes)
+            self.read_files.extend(scene.files)
             self.files[key] = (scene, indices)
         return self.files[key]
 
@@ -449,6 +462,8 @@ def _read_environment(raw: dict[str, Any], place: Place, assembly: _Assembly) ->
         raise here.error(str(error)) from None
     assembly.notes.extend(notes)
     scale = np.broadcast_to(values.get("scale", 1.0), 3)
+    if float(image.max()) * scale.max() > np.float32(MAX_RADIANCE):
+        raise place.key("scale").error(f"the image times scale exceeds {MAX_RADIANCE:g}")
     return Environment(_triple(scale), image, rotation)
 
 

@@ -6,8 +6,8 @@ from psf_cl.stages.spec import Context, StageSpec
 
 
 def plan(context: Context) -> StageSpec | None:
-    """Return the stage, or None if the scene has no light to connect to."""
-    if not any(context.on(name) for name in ("AREA_LIGHTS", "PUNCTUAL_LIGHTS", "ENVIRONMENT")):
+    """Return the stage, or None if no light is sampled."""
+    if not context.on("CONNECT"):
         return None
     return StageSpec(
         "connect",

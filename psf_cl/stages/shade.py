@@ -31,6 +31,8 @@ def plan(context: Context) -> StageSpec:
             "AREA_LIGHTS",
             "PUNCTUAL_LIGHTS",
             "ENVIRONMENT",
+            "ALPHA",
+            "CONNECT",
             "AOV_DIRECT",
             "AOV_FEATURES",
         ),

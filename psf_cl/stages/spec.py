@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -73,7 +73,7 @@ class Context:
     triangle_count: int = 0
     material_count: int = 0
     texture_count: int = 0
-    outputs: frozenset[str] = field(default_factory=frozenset)
+    statistics: bool = False
 
     def on(self, name: str) -> bool:
         return bool(self.features[name].value)

@@ -53,12 +53,12 @@ kernel void sample_lights(
     STORE_U(extended, 0, pick_u(s.extended, (UInt)(1u), (UInt)(0u)));
 }
 
-/// hits: distance, cosine, area of points on the emitters `light`.
+/// hits: distance and cosine at points of the emitters `light`.
 kernel void list_densities(
     global const Light *lights, global const uint *light, global const float *hits, global float *pdfs)
 {
 #if AREA_LIGHTS
-    STORE(pdfs, 0, area_light_density(lights, LOAD_U(light, 0), LOAD(hits, 0), LOAD(hits, 1), LOAD(hits, 2)));
+    STORE(pdfs, 0, area_light_density(lights, LOAD_U(light, 0), LOAD(hits, 0), LOAD(hits, 1)));
 #endif
 }
 

@@ -1,0 +1,315 @@
+"""Compare renders with Mitsuba 3: ``python tools/compare_mitsuba.py SCENE... --spp N --seeds K``.
+
+The Python that runs this needs both renderers: ``.venv/bin/pip install mitsuba``.  Mitsuba is no
+dependency of psf_cl.  Its fast ``llvm_ad_rgb`` variant needs LLVM (Debian: ``libllvm19``) and
+``DRJIT_LIBLLVM_PATH`` set to its library; without that ``scalar_rgb`` is used.
+
+What is compared is light transport, so only what both renderers mean alike is accepted: flat
+triangles, Lambertian materials, one-sided area lights, point and directional lights, a constant
+environment, pinhole and thin lens.  ``--lambertian`` makes other materials Lambertian first.
+
+Both renderers average K independent seeds.  The criterion, for each comparison: the means of all
+channels agree within 1 %, and the luminances of blocks of 16x16 pixels within 3 sigma, with as many
+exceptions as chance allows.  sigma comes from the seeds: a pixel's variance over them, summed over
+the block (pixels are independent in both renderers).  Exit code 1 if one comparison fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import psf_cl
+from psf_cl.cli.common import positive_integer, setting_argument, size_argument
+from psf_cl.errors import DeviceError, InputError
+from psf_cl.measure.errors import LUMINANCE
+from psf_cl.scene import transform
+from psf_cl.scene.model import Material, Scene, Shape
+from psf_cl.settings import Settings, resolve
+
+BLOCK = 16
+MEAN_TOLERANCE = 0.01
+
+# Chance of a normal deviate beyond 3 sigma, and a distance that no block of a picture should reach.
+BEYOND_THREE = math.erfc(3.0 / math.sqrt(2.0))
+FAR = 6.0
+
+# Where a block has no noise (an emitter seen directly) the renderers still round differently.
+ROUNDING = 1e-5
+
+# Samples that one call of Mitsuba keeps in memory.
+MITSUBA_SAMPLES = 1 << 22
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Mean over independent seeds, ``(h, w, 3)``, and the variance of its luminance, ``(h, w)``."""
+
+    mean: np.ndarray
+    variance: np.ndarray
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How two estimates differ.
+
+    Attributes:
+        ratio, ratio_sigma: ``(3,)``; mean of ours over theirs by channel, and the sigma of that of
+            luminance.
+        z: ``(blocks_down, blocks_across)``, difference of luminance over its sigma.
+        resolution: median over blocks of sigma over luminance: what the comparison could see.
+    """
+
+    ratio: np.ndarray
+    ratio_sigma: float
+    z: np.ndarray
+    resolution: float
+
+    @property
+    def outside(self) -> int:
+        return int(np.count_nonzero(np.abs(self.z) > 3.0))
+
+    @property
+    def allowed(self) -> int:
+        """Return how many blocks may lie beyond 3 sigma by chance: binomial mean plus 3 sigma."""
+        expected = self.z.size * BEYOND_THREE
+        return math.floor(expected + 3.0 * math.sqrt(expected))
+
+    @property
+    def passed(self) -> bool:
+        close = np.abs(self.ratio - 1.0).max() <= MEAN_TOLERANCE
+        return bool(close and self.outside <= self.allowed and np.abs(self.z).max() < FAR)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run all comparisons; return 1 if one of them fails."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scenes", metavar="SCENE", nargs="+")
+    parser.add_argument("--spp", type=positive_integer, default=64, help="for each seed (64)")
+    parser.add_argument("--seeds", type=positive_integer, default=8, help="at least 2 (8)")
+    parser.add_argument("--size", metavar="WxH", type=size_argument, help="instead of the scene's")
+    parser.add_argument("--lambertian", action="store_true", help="make all materials Lambertian")
+    parser.add_argument(
+        "--set",
+        dest="runs",
+        metavar="KEY=VALUE",
+        type=setting_argument,
+        nargs="+",
+        action="append",
+        help="settings of our renderer; given again: compare these as well",
+    )
+    parser.add_argument("--variant", help="of Mitsuba")
+    args = parser.parse_args(arguments)
+    if args.seeds < 2:
+        parser.error("--seeds: expected at least 2: the noise is measured between seeds")
+    fast = "llvm_ad_rgb" if os.environ.get("DRJIT_LIBLLVM_PATH") else "scalar_rgb"
+    mi.set_variant(args.variant or fast)
+    table = Table("scene", "settings", "mean r g b", "+-", "blocks > 3 sigma", "worst", "sigma z")
+    table.add_column("resolution", justify="right")
+    table.add_column("")
+    passed = True
+    for path in args.scenes:
+        scene = flat(psf_cl.load_scene(path, size=args.size), args.lambertian)
+        theirs: dict[tuple[int, ...], Estimate] = {}
+        for run in args.runs or [[]]:
+            settings = resolve(scene.render, scene.path, overrides=dict(run))
+            key = (settings.max_depth,)
+            if key not in theirs:
+                theirs[key] = render_mitsuba(scene, settings, args.spp, args.seeds)
+            result = agreement(render_ours(scene, settings, args.spp, args.seeds), theirs[key])
+            table.add_row(Path(path).stem, *_row(run, result))
+            passed &= result.passed
+    Console(width=max(140, Console().width)).print(table)
+    return 0 if passed else 1
+
+
+def flat(scene: Scene, lambertian: bool) -> Scene:
+    """Return the scene without shading normals and checked for what Mitsuba means alike.
+
+    Raises:
+        InputError: something in it would not be the same in Mitsuba.
+    """
+    materials = scene.materials
+    if lambertian:
+        materials = tuple(
+            replace(m, specular=0.0, metallic=0.0, transmission=0.0) for m in materials
+        )
+    for material in materials:
+        _check_material(material, scene.path)
+    if scene.environment.image is not None:
+        raise InputError(f"{scene.path}: expected an environment of constant radiance")
+    for light in scene.lights:
+        if light.kind == "spot" or light.range != math.inf:
+            raise InputError(f"{scene.path}: light {light.name!r}: expected no cone and no range")
+    shapes = tuple(replace(s, mesh=replace(s.mesh, normals=None)) for s in scene.shapes)
+    return replace(scene, materials=materials, shapes=shapes)
+
+
+def _check_material(material: Material, path: str) -> None:
+    wanted = {
+        "specular": 0.0,
+        "metallic": 0.0,
+        "transmission": 0.0,
+        "base_color_texture": -1,
+        "emission_texture": -1,
+        "alpha_mode": "opaque",
+    }
+    for key, value in wanted.items():
+        if getattr(material, key) != value:
+            raise InputError(f"{path}: material {material.name!r}: expected {key} = {value!r}")
+    if material.double_sided and max(material.emission) > 0.0:
+        raise InputError(f"{path}: material {material.name!r}: expected emission on one side")
+
+
+def mitsuba_scene(scene: Scene, max_depth: int) -> Any:
+    """Return the scene in Mitsuba; ``max_depth`` counts bounces, Mitsuba's path segments."""
+    camera = scene.cameras[scene.camera]
+    # Mitsuba's cameras look along +Z and have +X on their left.
+    turned = camera.transform @ np.diag([-1.0, 1.0, -1.0, 1.0])
+    sensor: dict[str, Any] = {
+        "type": "thinlens" if camera.lens_radius > 0.0 else "perspective",
+        "fov": math.degrees(camera.fov_y),
+        "fov_axis": "y",
+        "to_world": mi.ScalarTransform4f(turned),
+        "film": {
+            "type": "hdrfilm",
+            "width": scene.width,
+            "height": scene.height,
+            "rfilter": {"type": "box"},
+            "pixel_format": "rgb",
+            "component_format": "float32",
+        },
+        "sampler": {"type": "independent"},
+    }
+    if camera.lens_radius > 0.0:
+        sensor |= {"aperture_radius": camera.lens_radius, "focus_distance": camera.focus_distance}
+    content: dict[str, Any] = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": max_depth + 1},
+        "sensor": sensor,
+    }
+    for index, shape in enumerate(scene.shapes):
+        content[f"shape_{index}"] = _mesh(shape, scene.materials[shape.material])
+    for index, light in enumerate(scene.lights):
+        content[f"light_{index}"] = (
+            {"type": "point", "position": list(light.position), "intensity": _rgb(light.intensity)}
+            if light.kind == "point"
+            else {
+                "type": "directional",
+                "direction": list(light.direction),
+                "irradiance": _rgb(light.intensity),
+            }
+        )
+    if max(scene.environment.radiance) > 0.0:
+        content["sky"] = {"type": "constant", "radiance": _rgb(scene.environment.radiance)}
+    return mi.load_dict(content)
+
+
+def _rgb(values: Sequence[float]) -> dict[str, Any]:
+    return {"type": "rgb", "value": [float(value) for value in values]}
+
+
+def _mesh(shape: Shape, material: Material) -> Any:
+    properties = mi.Properties()
+    reflectance = {"type": "diffuse", "reflectance": _rgb(material.base_color)}
+    properties["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": reflectance})
+    if max(material.emission) > 0.0:
+        properties["emitter"] = mi.load_dict({"type": "area", "radiance": _rgb(material.emission)})
+    positions = transform.transform_points(shape.transform, shape.mesh.positions)
+    triangles = shape.mesh.triangles
+    if np.linalg.det(shape.transform[:3, :3]) < 0.0:
+        triangles = triangles[:, ::-1]
+    mesh = mi.Mesh(shape.name or "mesh", len(positions), len(triangles), props=properties)
+    values = mi.traverse(mesh)
+    values["vertex_positions"] = positions.astype(np.float32).ravel()
+    values["faces"] = triangles.astype(np.uint32).ravel()
+    values.update()
+    return mesh
+
+
+def render_mitsuba(scene: Scene, settings: Settings, spp: int, seeds: int) -> Estimate:
+    """Render with Mitsuba's path tracer, with independent samples."""
+    built = mitsuba_scene(scene, settings.max_depth)
+    part = min(spp, max(1, MITSUBA_SAMPLES // (scene.width * scene.height)))
+    counts = [min(part, spp - first) for first in range(0, spp, part)]
+    images = []
+    for seed in range(seeds):
+        total = np.zeros((scene.height, scene.width, 3))
+        for index, count in enumerate(counts):
+            number = seed * len(counts) + index
+            total += count * np.array(mi.render(built, spp=count, seed=number), np.float64)
+        images.append(total / spp)
+    return estimate(images)
+
+
+def render_ours(scene: Scene, settings: Settings, spp: int, seeds: int) -> Estimate:
+    """Render with psf_cl."""
+    images = []
+    for seed in range(seeds):
+        renderer = psf_cl.Renderer(scene, replace(settings, seed=seed))
+        renderer.render(spp=spp)
+        images.append(renderer.snapshot().rgb.astype(np.float64))
+        renderer.close()
+    return estimate(images)
+
+
+def estimate(images: list[np.ndarray]) -> Estimate:
+    """Average images of independent seeds."""
+    luminance = np.stack(images) @ LUMINANCE
+    return Estimate(np.mean(images, axis=0), luminance.var(axis=0, ddof=1) / len(images))
+
+
+def agreement(ours: Estimate, theirs: Estimate) -> Agreement:
+    """Compare two estimates of one picture."""
+    difference = (ours.mean - theirs.mean) @ LUMINANCE
+    level = (ours.mean + theirs.mean) @ LUMINANCE / 2.0
+    variance = ours.variance + theirs.variance
+    level, difference = _block_sums(level), _block_sums(difference)
+    sigma = np.hypot(np.sqrt(_block_sums(variance)), ROUNDING * level)
+    lit = level > 0.0
+    total = float((theirs.mean @ LUMINANCE).sum())
+    return Agreement(
+        ours.mean.mean(axis=(0, 1)) / theirs.mean.mean(axis=(0, 1)),
+        math.sqrt(variance.sum()) / total,
+        np.divide(difference, sigma, out=np.zeros_like(sigma), where=sigma > 0.0),
+        float(np.median(sigma[lit] / level[lit])),
+    )
+
+
+def _block_sums(image: np.ndarray) -> np.ndarray:
+    height, width = image.shape
+    rows, columns = np.arange(0, height, BLOCK), np.arange(0, width, BLOCK)
+    return np.add.reduceat(np.add.reduceat(image, rows, axis=0), columns, axis=1)
+
+
+def _row(run: list[tuple[str, str]], result: Agreement) -> list[str]:
+    return [
+        " ".join(f"{key}={value}" for key, value in run) or "as they are",
+        " ".join(f"{value:.4f}" for value in result.ratio),
+        f"{result.ratio_sigma:.4f}",
+        f"{result.outside} of {result.z.size} (at most {result.allowed})",
+        f"{np.abs(result.z).max():.2f}",
+        f"{float(np.sqrt((result.z**2).mean())):.3f}",
+        f"{100.0 * result.resolution:.2f} %",
+        "pass" if result.passed else "FAIL",
+    ]
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except (InputError, DeviceError) as error:
+        sys.exit(f"compare_mitsuba: {error}")
