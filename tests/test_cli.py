@@ -108,8 +108,11 @@ def fake(monkeypatch, tmp_path):
         vars(made).update(members)
         monkeypatch.setitem(sys.modules, name, made)
 
-    module("psf_cl.renderer", Renderer=Renderer)
-    module("psf_cl.device.device", open_device=lambda name, profiling: f"device {name}")
+    module(
+        "psf_cl.renderer",
+        Renderer=Renderer,
+        prepare_device=lambda name, profiling: f"device {name}",
+    )
     module("psf_cl.scene.load", load_scene=load_scene)
     monkeypatch.chdir(tmp_path)
     return Renderer
@@ -274,7 +277,7 @@ def test_failures_of_the_run_have_their_own_codes(fake, tmp_path, capsys, error,
 
 
 def test_a_missing_pyopencl_is_one_line(fake, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "psf_cl.device.device", None)
+    monkeypatch.setitem(sys.modules, "psf_cl.renderer", None)
     assert main(["render", "a.toml", "--quiet"]) == 1
     assert "psf-cl doctor" in one_error(capsys.readouterr())
 

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +31,7 @@ from psf_cl.settings import DEVICE_VARIABLE
 if TYPE_CHECKING:
     import numpy as np
 
+    from psf_cl.device.device import Device
     from psf_cl.image import Image
     from psf_cl.renderer import Progress, Renderer
     from psf_cl.scene.model import Scene
@@ -82,19 +84,21 @@ def run(args: argparse.Namespace) -> int:
     outputs = [exr, png] + ([Path(args.stats)] if args.stats else [])
     for path in outputs:
         check_writable(path)
-    scene, settings = load_with_settings(args)
-    _check_distinct(outputs, [*scene.files, args.reference])
-    make_plan(scene, settings, args.aov, crop=args.crop)  # For its checks, before a device opens.
-    reference = _reference(args, scene) if args.reference else None
-
-    try:
-        from psf_cl.device.device import open_device
-        from psf_cl.renderer import Renderer
-    except ImportError as error:
-        raise DeviceError(f"no OpenCL ({error}); psf-cl doctor says what to do") from error
-
     statistics = args.stats is not None
-    device = open_device(args.device, profiling=statistics)
+    # The device gets ready while the scene is read; a mistake in the scene does not wait for it.
+    background = ThreadPoolExecutor(1)
+    try:
+        opening = background.submit(_open_device, args.device, statistics)
+        scene, settings = load_with_settings(args)
+        _check_distinct(outputs, [*scene.files, args.reference])
+        make_plan(scene, settings, args.aov, crop=args.crop)  # For its checks.
+        reference = _reference(args, scene) if args.reference else None
+        device = opening.result()
+    finally:
+        background.shutdown(wait=False)
+
+    from psf_cl.renderer import Renderer
+
     if not args.quiet:
         tell_notes(scene)
     renderer = Renderer(
@@ -133,6 +137,14 @@ def run(args: argparse.Namespace) -> int:
     if stopped:
         print("psf-cl: interrupted; what was rendered is written", file=sys.stderr)
     return 130 if stopped else 0
+
+
+def _open_device(text: str | None, profiling: bool) -> Device:
+    try:
+        from psf_cl.renderer import prepare_device
+    except ImportError as error:
+        raise DeviceError(f"no OpenCL ({error}); psf-cl doctor says what to do") from error
+    return prepare_device(text, profiling)
 
 
 class ErrorCurve:

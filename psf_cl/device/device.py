@@ -13,12 +13,11 @@ import pyopencl as cl
 
 from psf_cl.device.selftest import run_self_test
 from psf_cl.errors import DeviceError, InputError
+from psf_cl.settings import DEVICE_VARIABLE
 from psf_cl.traits import DeviceTraits
 
 if TYPE_CHECKING:
     from psf_cl.device.program import Program
-
-DEVICE_VARIABLE = "PSF_CL_DEVICE"
 
 
 @dataclass(frozen=True)
