@@ -13,6 +13,7 @@ import pytest
 from scene_builder import LUMINANCE, build, camera, floor, glowing, render, renderer
 
 from psf_cl.device.device import open_device
+from psf_cl.errors import InputError
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.model import Light, Material
 
@@ -66,7 +67,8 @@ def test_single_steps_give_the_bits_of_one_render(device, truth):
 
 def test_looking_at_the_image_in_between_changes_nothing(device, truth):
     opened = renderer(device, scene(), OUTPUTS)
-    for spp in (0, 1, 7, 8, 40):
+    assert not opened.image().aovs["samples"].any()
+    for spp in (1, 7, 8, 40):
         opened.render(spp=spp)
         opened.snapshot(("rgb", "direct"))
         assert (opened.image().aovs["samples"] == spp).all()
@@ -167,10 +169,11 @@ def test_stopping_after_some_passes_leaves_exactly_those(device):
 
 
 def test_stopping_in_the_first_pass_leaves_the_samples_that_there_are(device):
-    # So large for its pool that the first look comes before the first pass is done.
+    # So large for its pool that the second look comes before the first pass is done.
     small = open_device(traits=replace(device.traits, slots=device.traits.block * 4))
     opened = renderer(small, scene((96, 64)), OUTPUTS)
-    assert opened.render(spp=100, progress=lambda progress: False) is False
+    looks = iter([True])
+    assert opened.render(spp=100, progress=lambda progress: next(looks, False)) is False
     assert opened.scheduler.passes == 0
     partial = opened.image()
     there = partial.aovs["samples"][..., 0]
@@ -221,3 +224,43 @@ def test_number_of_threads_does_not_show(device):
         digests.append(digest)
     assert digests[0] == digests[1]
     assert units[0] == 1 and units[1] == min(2, os.cpu_count() or 1)
+
+
+@pytest.mark.parametrize(
+    "budget",
+    [
+        {},
+        {"spp": 1, "seconds": 1.0},
+        {"spp": 0},
+        {"spp": 2.5},
+        {"spp": 1 << 40},
+        {"seconds": 0.0},
+        {"seconds": float("nan")},
+        {"seconds": float("inf")},
+    ],
+)
+def test_a_budget_that_would_never_end_is_refused(device, budget):
+    opened = renderer(device, scene((2, 2)))
+    with pytest.raises(InputError, match=r"spp|seconds"):
+        opened.render(**budget)
+    opened.close()
+
+
+def test_batches_start_small_again_after_an_empty_pool(device):
+    """Tails of passes leave the pool empty: their speed says nothing about a full one."""
+    opened = renderer(device, scene())
+    for _ in range(10):
+        opened.step()
+    looks = []
+    opened.render(spp=400, progress=lambda progress: looks.append(progress.passes))
+    # The first look comes long before the end.
+    assert looks[0] < 200 and len(looks) > 2
+    opened.close()
+
+
+def test_a_renderer_that_could_not_be_made_holds_no_memory(device, monkeypatch):
+    before = device.allocated_bytes
+    monkeypatch.setattr("psf_cl.renderer.build_bvh", lambda *arguments: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        renderer(device, scene())
+    assert device.allocated_bytes == before
