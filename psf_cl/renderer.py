@@ -254,6 +254,13 @@ class Renderer:
             "seed": self.settings.seed,
         }
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know that only building the scene has shown, one sentence each."""
+        if not self.bvh.dropped:
+            return ()
+        return (f"{self.bvh.dropped} triangles are left out: a coordinate is not finite",)
+
     def close(self) -> None:
         """Give the device memory back."""
         self.device.wait()

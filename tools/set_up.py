@@ -63,7 +63,10 @@ def make_environment() -> None:
     if error:
         fail(f"{error}\nOn Debian: sudo apt-get install python3-venv")
     say("installing psf_cl and what it needs")
-    if pip("install", "--editable", f"{ROOT}[test]"):
+    # By path: the import hook of other editable installs loses against a folder named psf_cl, which
+    # is what a checkout is called where somebody may well stand.
+    by_path = ("--config-settings", "editable_mode=compat")
+    if pip("install", *by_path, "--editable", f"{ROOT}[test]"):
         fail("pip could not install the packages (see above); is there a network?")
     STAMP.write_text(state.hexdigest())
 
