@@ -60,12 +60,11 @@ class Settings:
 
     def __post_init__(self) -> None:
         for item in dataclasses.fields(self):
-            object.__setattr__(
-                self, item.name, _checked(item, getattr(self, item.name), "settings")
-            )
+            value = _checked(item, getattr(self, item.name), "settings: ")
+            object.__setattr__(self, item.name, value)
 
-    def with_values(self, values: Mapping[str, Any], source: str = "settings") -> Settings:
-        """Return a copy with ``values`` applied; errors name ``source`` and the key.
+    def with_values(self, values: Mapping[str, Any], prefix: str = "settings: ") -> Settings:
+        """Return a copy with ``values`` applied; errors begin with ``prefix`` and the key.
 
         Strings are taken for numbers where the setting is a number (``--set max_depth=4``).
 
@@ -78,17 +77,17 @@ class Settings:
             if key not in known:
                 close = difflib.get_close_matches(key, known, n=1)
                 hint = f"; did you mean {close[0]}?" if close else f"; known: {', '.join(known)}"
-                raise InputError(f"{source}: unknown setting {shown(key)}{hint}")
-            checked[key] = _checked(known[key], value, source)
+                raise InputError(f"{prefix}{key}: unknown setting{hint}")
+            checked[key] = _checked(known[key], value, prefix)
         return dataclasses.replace(self, **checked)
 
 
-def _checked(item: dataclasses.Field[Any], value: Any, source: str) -> Any:
+def _checked(item: dataclasses.Field[Any], value: Any, prefix: str) -> Any:
     choices = item.metadata.get("choices")
     if choices is not None:
         if value not in choices:
             raise InputError(
-                f"{source}: {item.name} must be one of {', '.join(choices)}; got {shown(value)}"
+                f"{prefix}{item.name} must be one of {', '.join(choices)}; got {shown(value)}"
             )
         return value
     low, high = item.metadata["range"]
@@ -100,11 +99,11 @@ def _checked(item: dataclasses.Field[Any], value: Any, source: str) -> Any:
         number = None
     if isinstance(number, bool) or not isinstance(number, (int, float) if kind is float else int):
         raise InputError(
-            f"{source}: {item.name} must be {wanted} from {low} to {high}; got {shown(value)}"
+            f"{prefix}{item.name} must be {wanted} from {low} to {high}; got {shown(value)}"
         )
     # Comparing is exact for integers of any length; no infinity or NaN is in a range.
     if not low <= number <= high:
-        raise InputError(f"{source}: {item.name} must be from {low} to {high}; got {shown(value)}")
+        raise InputError(f"{prefix}{item.name} must be from {low} to {high}; got {shown(value)}")
     return kind(number)
 
 
@@ -113,14 +112,14 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
-def preset_values(name: str, source: str = "settings") -> dict[str, Any]:
+def preset_values(name: str, prefix: str = "settings: ") -> dict[str, Any]:
     """Return what preset ``name`` changes.
 
     Raises:
         InputError: there is no such preset.
     """
     if name not in PRESETS:
-        raise InputError(f"{source}: preset must be one of {', '.join(PRESETS)}; got {shown(name)}")
+        raise InputError(f"{prefix}preset must be one of {', '.join(PRESETS)}; got {shown(name)}")
     return PRESETS[name]
 
 
@@ -137,13 +136,14 @@ def resolve(
         scene_source: what to name in errors about ``scene_values``.
     """
     settings = Settings()
+    place = f"{scene_source}: render."
     values = dict(scene_values)
     if "preset" in values:
         name = values.pop("preset")
         if not isinstance(name, str):
-            raise InputError(f"{scene_source}: preset must be a string; got {shown(name)}")
-        settings = settings.with_values(preset_values(name, scene_source), scene_source)
-    settings = settings.with_values(values, scene_source)
+            raise InputError(f"{place}preset must be a string; got {shown(name)}")
+        settings = settings.with_values(preset_values(name, place), place)
+    settings = settings.with_values(values, place)
     if preset is not None:
-        settings = settings.with_values(preset_values(preset, "--preset"), "--preset")
-    return settings.with_values(overrides or {}, "--set")
+        settings = settings.with_values(preset_values(preset, "--"), "--preset: ")
+    return settings.with_values(overrides or {}, "--set ")

@@ -225,10 +225,12 @@ BAD_USAGE = {
     "render --set max_depth=1 a.toml": "before --set",
     "render a.toml --set max_dept=1": "did you mean max_depth",
     "render a.toml --set max_depth=-1": "max_depth",
-    "render a.toml --seed -1": "seed",
-    "render a.toml --seed x": "seed",
-    "render a.toml --preset none": "preset",
+    "render a.toml --set seed=-1": "error: --set seed must be from 0",
+    "render a.toml --seed -1": "error: --seed must be from 0",
+    "render a.toml --seed x": "error: --seed must be an integer",
+    "render a.toml --preset none": "error: --preset must be one of",
     "render a.toml --aov depth,hue": "hue",
+    "render a.toml --aov all,hue": "unknown hue",
     "render a.toml -o a.png": ".exr",
     "render a.toml -o none/a.exr": "cannot write: there is no folder",
     "render a.toml -o file/a.exr": "cannot write: Not a directory",
@@ -245,6 +247,11 @@ BAD_USAGE = {
     "compare small.exr small.exr --blocks 9": "1 to 4 blocks",
     "compare small.exr small.exr --blocks 0": "--blocks",
     "compare small.exr small.exr --difference none/d.png": "cannot write",
+    "compare small.exr small.exr --difference small.exr": "expected a name that ends in .png",
+    "compare small.exr black.exr --blocks 2 --difference d.png": "(--difference needs equal sizes)",
+    "compare small.exr black.exr --blocks 2 --max-relmse 0": "(--max-relmse needs equal sizes)",
+    "compare small.exr small.exr --max-relmse -1": "--max-relmse: expected a number, 0 or above",
+    "compare small.exr small.exr --max-relmse inf": "--max-relmse: expected a number, 0 or above",
 }
 
 
@@ -259,6 +266,27 @@ def test_bad_input_is_one_line_exit_code_2_and_no_file(fake, tmp_path, capsys, a
     assert BAD_USAGE[arguments] in error
     assert files_in(tmp_path) == before
     assert fake.made == {}, "the renderer was built before everything was checked"
+
+
+FILES = {
+    "render": ["--output", "--reference", "--stats", "--environment"],
+    "compare": ["--difference"],
+}
+
+
+@pytest.mark.parametrize(("command", "option"), [(c, o) for c in FILES for o in FILES[c]])
+def test_an_empty_file_name_is_refused(fake, tmp_path, capsys, command, option):
+    names = ["a.toml"] if command == "render" else ["a.exr", "a.exr"]
+    assert main([command, *names, option, ""]) == 2
+    error = one_error(capsys.readouterr())
+    assert option in error and "expected the name of a file; got ''" in error
+    assert files_in(tmp_path) == []
+
+
+@pytest.mark.parametrize("names", ["all", "depth,all"])
+def test_all_images_can_be_asked_for_at_once(fake, names):
+    assert main(["render", "a.toml", "--spp", "1", "--aov", names]) == 0
+    assert fake.made["outputs"] == set(AOVS)
 
 
 @pytest.mark.parametrize(
@@ -442,6 +470,36 @@ def test_no_file_that_the_scene_names_is_overwritten(all_features, capsys, outpu
     assert {path: path.read_bytes() for path in all_features.iterdir()} == before
 
 
+@pytest.mark.parametrize(
+    ("names", "asked", "hint"),
+    [
+        (["", ""], "foo", "no camera 'foo'; its cameras have no names"),
+        (["near", ""], "foo", "no camera 'foo'; known: 'near'"),
+        (["near", ""], "", "no camera ''; known: 'near'"),
+        ([], "foo", "no camera 'foo'; it has no cameras"),
+    ],
+)
+def test_a_camera_that_is_not_there_is_answered_by_those_that_are(
+    tmp_path, capsys, names, asked, hint
+):
+    path = tmp_path / "a.toml"
+    camera = "[[cameras]]\nposition = [0, 1, 4]\ntarget = [0, 0, 0]\n"
+    cameras = [camera + (f'name = "{name}"\n' if name else "") for name in names]
+    path.write_text('[[shapes]]\nprimitive = "quad"\n' + "".join(cameras))
+    assert main(["plan", str(path), "--camera", asked]) == 2
+    assert one_error(capsys.readouterr()).endswith(f"a.toml: {hint}\n")
+
+
+def test_notes_are_lines_of_one_style(tmp_path, capsys):
+    path = tmp_path / "a.toml"
+    path.write_text('[[shapes]]\nprimitive = "quad"\n')
+    assert main(["plan", str(path)]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2, "no camera and no light are two notes"
+    for line in lines:
+        assert line.startswith("note: the ") and not line.endswith(".")
+
+
 def test_plan_is_for_the_kind_of_device_that_was_asked_for(all_features, capsys):
     for kind, slots in (("cpu", 1 << 15), ("gpu", 1 << 18)):
         assert main(["plan", "all.toml", "--kind", kind]) == 0
@@ -616,6 +674,22 @@ def test_compare_prints_metrics_and_judges_by_the_limit(tmp_path, monkeypatch, c
     assert main("compare a.exr b.exr --max-relmse 0.25".split()) == 0
     assert main("compare a.exr b.exr --max-relmse 0.24".split()) == 1
     assert "FAILED: relMSE above 0.24" in capsys.readouterr().out
+    assert main("compare a.exr b.exr --max-relmse 0".split()) == 1
+    assert "FAILED: relMSE above 0\n" in capsys.readouterr().out
+    assert main("compare b.exr b.exr --max-relmse 0".split()) == 0
+
+
+@pytest.mark.parametrize("overwritten", ["a.exr", "b.exr"])
+def test_compare_overwrites_no_image_that_it_compares(tmp_path, monkeypatch, capsys, overwritten):
+    monkeypatch.chdir(tmp_path)
+    constant("a.exr", 1.5)
+    constant("b.exr", 1.0)
+    before = Path(overwritten).read_bytes()
+    # A name that ends in .png may still lead to an input.
+    Path("d.png").symlink_to(overwritten)
+    assert main("compare a.exr b.exr --difference d.png".split()) == 2
+    assert "d.png: cannot write: it is another input or output" in one_error(capsys.readouterr())
+    assert Path(overwritten).read_bytes() == before
 
 
 def test_compare_fails_on_pixels_that_are_not_finite(tmp_path, monkeypatch, capsys):
@@ -671,6 +745,26 @@ def test_the_program_ends_without_a_traceback(tmp_path):
     help_text = run("render", "--help")
     assert help_text.returncode == 0 and "default 64" in help_text.stdout
     assert "max_depth" in help_text.stdout
+
+
+# What modules make of an exception while they are imported.
+IMPORTS = {
+    "replaced": "raise ImportError('initialization failed') from None",
+    "swallowed": "pass",
+}
+
+
+@pytest.mark.parametrize("fate", IMPORTS)
+def test_ctrl_c_during_an_import_is_one_line(tmp_path, fate):
+    (tmp_path / "OpenEXR.py").write_text(
+        "import signal\n"
+        "try:\n    signal.raise_signal(signal.SIGINT)\n"
+        f"except KeyboardInterrupt:\n    {IMPORTS[fate]}\n"
+    )
+    paths = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    done = run("compare", "a.exr", "b.exr", env=os.environ | {"PYTHONPATH": paths}, cwd=ROOT)
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr == "psf-cl: error: interrupted\n"
 
 
 def test_help_imports_nothing_heavy():

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import sys
 import time
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 from psf_cl.errors import InputError
 from psf_cl.settings import AOVS, PRESETS, Settings, resolve
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rich.console import RenderableType
 
     from psf_cl.scene.model import Scene
@@ -50,8 +54,16 @@ def crop_argument(text: str) -> tuple[int, int, int, int]:
 
 
 def aov_argument(text: str) -> frozenset[str]:
-    """Parse a list of AOV names; ``make_plan`` knows which there are."""
-    return frozenset(part.strip() for part in text.split(","))
+    """Parse a list of AOV names, or ``all``; ``make_plan`` knows which there are."""
+    names = frozenset(part.strip() for part in text.split(","))
+    return names - {"all"} | set(AOVS) if "all" in names else names
+
+
+def file_argument(text: str) -> str:
+    """Parse the name of a file."""
+    if not text:
+        raise argparse.ArgumentTypeError(f"expected the name of a file; got {text!r}")
+    return text
 
 
 def positive_integer(text: str) -> int:
@@ -67,6 +79,14 @@ def positive_number(text: str) -> float:
     number = _number(text)
     if not (0.0 < number < math.inf):
         raise argparse.ArgumentTypeError(f"expected a number above 0; got {text!r}")
+    return number
+
+
+def number_from_zero(text: str) -> float:
+    """Parse a finite number, 0 or above."""
+    number = _number(text)
+    if not (0.0 <= number < math.inf):
+        raise argparse.ArgumentTypeError(f"expected a number, 0 or above; got {text!r}")
     return number
 
 
@@ -92,7 +112,12 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     """Add all that decides what is rendered and how: the same for ``render`` and ``plan``."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = _settings_help()
-    parser.add_argument("scene", metavar="SCENE", help=".toml, .gltf, .glb, .obj, .ply or .stl")
+    parser.add_argument(
+        "scene",
+        metavar="SCENE",
+        type=file_argument,
+        help=".toml, .gltf, .glb, .obj, .ply or .stl",
+    )
     parser.add_argument("--preset", metavar="NAME", help=f"one of: {', '.join(PRESETS)}")
     parser.add_argument(
         "--set",
@@ -113,14 +138,17 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--camera", metavar="NAME", help="a camera of the scene, by its name")
     parser.add_argument(
-        "--environment", metavar="FILE", help="lat-long image (.exr, .hdr) as the scene's sky"
+        "--environment",
+        metavar="FILE",
+        type=file_argument,
+        help="lat-long image (.exr, .hdr) as the scene's sky",
     )
     parser.add_argument(
         "--aov",
         metavar="A,B,...",
         type=aov_argument,
         default=frozenset(),
-        help=f"further channels: {', '.join(AOVS)}",
+        help=f"further channels: {', '.join(AOVS)}; or all",
     )
 
 
@@ -132,11 +160,25 @@ def load_with_settings(args: argparse.Namespace) -> tuple[Scene, Settings]:
     """
     from psf_cl.scene.load import load_scene
 
-    overrides = dict(args.settings)
-    if args.seed is not None:
-        overrides["seed"] = args.seed
     scene = load_scene(args.scene, environment=args.environment, camera=args.camera, size=args.size)
-    return scene, resolve(scene.render, scene.path, args.preset, overrides)
+    settings = resolve(scene.render, scene.path, args.preset, dict(args.settings))
+    if args.seed is not None:
+        settings = settings.with_values({"seed": args.seed}, "--")
+    return scene, settings
+
+
+def check_distinct(outputs: Iterable[str | Path], inputs: Iterable[str | Path | None]) -> None:
+    """Make sure that no output is an input or another output.
+
+    Raises:
+        InputError: one is, by whatever name.
+    """
+    taken = {os.path.realpath(path) for path in inputs if path is not None}
+    for path in outputs:
+        real = os.path.realpath(path)
+        if real in taken:
+            raise InputError(f"{path}: cannot write: it is another input or output of this command")
+        taken.add(real)
 
 
 def tell_notes(scene: Scene) -> None:

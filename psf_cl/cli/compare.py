@@ -5,7 +5,13 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from psf_cl.cli.common import positive_integer, positive_number, show
+from psf_cl.cli.common import (
+    check_distinct,
+    file_argument,
+    number_from_zero,
+    positive_integer,
+    show,
+)
 from psf_cl.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,11 +24,12 @@ _FULL_COLOUR = 0.5
 def add_parser(commands: Any) -> None:
     """Add the command to the subparsers of ``psf-cl``."""
     parser = commands.add_parser("compare", help="error metrics of one image against another")
-    parser.add_argument("image", metavar="A.exr", help="the image to judge")
-    parser.add_argument("reference", metavar="B.exr", help="the reference")
+    parser.add_argument("image", metavar="A.exr", type=file_argument, help="the image to judge")
+    parser.add_argument("reference", metavar="B.exr", type=file_argument, help="the reference")
     parser.add_argument(
         "--difference",
         metavar="OUT.png",
+        type=file_argument,
         help="write a picture: white where equal, red where A is brighter, blue where it is "
         "darker; full colour at 50 %% of B's luminance",
     )
@@ -35,7 +42,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--max-relmse",
         metavar="E",
-        type=positive_number,
+        type=number_from_zero,
         help="exit with 1 if the relMSE is above E",
     )
     parser.set_defaults(run=run)
@@ -51,6 +58,9 @@ def run(args: argparse.Namespace) -> int:
     from psf_cl.measure import errors
 
     if args.difference:
+        if not args.difference.lower().endswith(".png"):
+            raise InputError(f"{args.difference}: expected a name that ends in .png")
+        check_distinct([args.difference], [args.image, args.reference])
         check_writable(args.difference)
     image, reference = read_exr(args.image), read_exr(args.reference)
     table = Table("metric")
@@ -58,8 +68,15 @@ def run(args: argparse.Namespace) -> int:
     passed = True
 
     same_size = (image.width, image.height) == (reference.width, reference.height)
-    if same_size or args.difference or args.max_relmse or not args.blocks:
-        reference = errors.matching_part(reference, image, args.reference)
+    by_pixel = {"--difference": args.difference, "--max-relmse": args.max_relmse}
+    needing = [option for option, value in by_pixel.items() if value is not None]
+    if same_size or needing or not args.blocks:
+        try:
+            reference = errors.matching_part(reference, image, args.reference)
+        except InputError as error:
+            because = args.blocks and needing and not same_size
+            reason = f" ({needing[0]} needs equal sizes)" if because else ""
+            raise InputError(f"{error}{reason}") from error
         metrics = errors.compare(image.rgb, reference.rgb, flip=True)
         for name, value in metrics.as_dict().items():
             table.add_row(name, f"{value:.6g}")

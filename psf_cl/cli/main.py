@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import os
+import signal
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
+from types import FrameType
+from typing import TYPE_CHECKING, NoReturn
 
-import psf_cl
-from psf_cl.cli import compare, doctor, plan, render
-from psf_cl.cli.common import Parser
 from psf_cl.errors import DeviceError, InputError
 
-_COMMANDS = (render, plan, doctor, compare)
+# The rest is imported by ``_parser``, when ``program`` already answers Ctrl-C.
+if TYPE_CHECKING:
+    import argparse
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -52,7 +52,24 @@ def program() -> NoReturn:
     At once: an interrupted command may leave a thread in a compiler, which cannot be stopped and
     crashes when the libraries are unloaded below it.
     """
-    code = main()
+    signal.signal(signal.SIGINT, _interrupt)
+    _end(main())
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """End the process if it is importing, else raise KeyboardInterrupt.
+
+    A module that is being imported may swallow the exception or turn it into an ImportError; and
+    no file is half written then.
+    """
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            _end(_fail("interrupted", 130))
+        frame = frame.f_back
+    raise KeyboardInterrupt
+
+
+def _end(code: int) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(BrokenPipeError):
             stream.flush()
@@ -60,10 +77,14 @@ def program() -> NoReturn:
 
 
 def _parser() -> argparse.ArgumentParser:
+    import psf_cl
+    from psf_cl.cli import compare, doctor, plan, render
+    from psf_cl.cli.common import Parser
+
     parser = Parser(prog="psf-cl", description="Path tracing on any OpenCL device.")
     parser.add_argument("--version", action="version", version=f"psf-cl {psf_cl.__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    for command in _COMMANDS:
+    for command in (render, plan, doctor, compare):
         command.add_parser(commands)
     return parser
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
-import os
 import signal
 import sys
 import threading
@@ -18,7 +17,9 @@ from typing import TYPE_CHECKING, Any
 from psf_cl.cli.common import (
     START,
     add_scene_arguments,
+    check_distinct,
     exposure_argument,
+    file_argument,
     load_with_settings,
     positive_integer,
     positive_number,
@@ -44,7 +45,11 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser("render", help="render a scene to an EXR and a PNG")
     add_scene_arguments(parser)
     parser.add_argument(
-        "-o", "--output", metavar="OUT.exr", help="default: the scene's name in this folder"
+        "-o",
+        "--output",
+        metavar="OUT.exr",
+        type=file_argument,
+        help="default: the scene's name in this folder",
     )
     budget = parser.add_mutually_exclusive_group()
     budget.add_argument(
@@ -67,9 +72,14 @@ def add_parser(commands: Any) -> None:
         help=f"part of its name; default: ${DEVICE_VARIABLE}, or the best",
     )
     parser.add_argument(
-        "--reference", metavar="REF.exr", help="measure the error against this image"
+        "--reference",
+        metavar="REF.exr",
+        type=file_argument,
+        help="measure the error against this image",
     )
-    parser.add_argument("--stats", metavar="FILE.json", help="write times, counts and errors")
+    parser.add_argument(
+        "--stats", metavar="FILE.json", type=file_argument, help="write times, counts and errors"
+    )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     parser.set_defaults(run=run)
 
@@ -90,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         opening = background.submit(_open_device, args.device, statistics)
         scene, settings = load_with_settings(args)
-        _check_distinct(outputs, [*scene.files, args.reference])
+        check_distinct(outputs, [*scene.files, args.reference])
         make_plan(scene, settings, args.aov, crop=args.crop)  # For its checks.
         reference = _reference(args, scene) if args.reference else None
         device = opening.result()
@@ -219,15 +229,6 @@ def _reference(args: argparse.Namespace, scene: Scene) -> np.ndarray:
     except InputError as error:
         raise InputError(f"{args.reference}: {error}") from error
     return rgb
-
-
-def _check_distinct(outputs: list[Path], inputs: list[str | None]) -> None:
-    taken = {os.path.realpath(path): path for path in inputs if path is not None}
-    for path in outputs:
-        real = os.path.realpath(path)
-        if real in taken:
-            raise InputError(f"{path}: cannot write: it is another input or output of this render")
-        taken[real] = str(path)
 
 
 def _summary(path: Path, image: Image) -> str:

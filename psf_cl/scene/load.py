@@ -98,13 +98,16 @@ def _with_size(scene: Scene, size: tuple[int, int] | None) -> Scene:
 def _with_camera(scene: Scene, name: str | None) -> Scene:
     if name is not None:
         names = [camera.name for camera in scene.cameras]
-        if name not in names:
-            known = ", ".join(map(repr, names)) or "it has none"
-            raise InputError(f"{scene.path}: no camera {name!r}; known: {known}")
+        if not name or name not in names:
+            if any(names):
+                hint = f"known: {', '.join(repr(known) for known in names if known)}"
+            else:
+                hint = "its cameras have no names" if names else "it has no cameras"
+            raise InputError(f"{scene.path}: no camera {name!r}; {hint}")
         return replace(scene, camera=names.index(name))
     if scene.cameras:
         return scene
-    note = "The file has no camera: the view frames the whole scene."
+    note = "the file has no camera: the view frames the whole scene"
     return replace(scene, cameras=(framing_camera(scene),), camera=0, notes=(*scene.notes, note))
 
 
@@ -154,7 +157,7 @@ def _with_light(scene: Scene) -> Scene:
     emitting = any(emits(material) and not is_invisible(material) for material in used)
     if emitting or any(map(shines, scene.lights)) or has_environment(scene.environment):
         return scene
-    note = "The scene has no light: a sky of constant radiance (1, 1, 1) is added."
+    note = "the scene has no light: a sky of constant radiance (1, 1, 1) is added"
     return replace(scene, environment=Environment(DEFAULT_SKY), notes=(*scene.notes, note))
 
 
