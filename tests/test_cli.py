@@ -39,6 +39,7 @@ class FakeRenderer:
     made: ClassVar[dict] = {}
     on_pass = staticmethod(lambda passes: None)
     build_error: BaseException | None = None
+    notes: ClassVar[tuple[str, ...]] = ()
     value = 1.0
     started = 1.0
 
@@ -788,3 +789,12 @@ def test_a_closed_pipe_is_no_error(tmp_path):
     done = subprocess.run(command, stdout=write_end, stderr=subprocess.PIPE, check=False)
     os.close(write_end)
     assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_triangles_with_broken_vertices_are_said(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "torn.obj").write_text(
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv nan 0 0\nf 1 2 3\nf 1 2 4\n", encoding="utf-8"
+    )
+    assert main(["render", "torn.obj", "--size", "8x8", "--spp", "1"]) == 0
+    assert "note: 1 triangles are left out: a coordinate is not finite" in capsys.readouterr().err

@@ -179,7 +179,7 @@ def test_missing_mtl_and_textures_are_noted_not_fatal(tmp_path):
     notes = " ".join(scene.notes)
     assert "a.mtl" in notes
     assert "gone.png" in notes
-    assert "undefined materials stay grey: n." in notes
+    assert "undefined materials stay grey: n" in notes
 
 
 def test_vertices_that_are_not_finite_are_kept_and_left_out_of_the_view(tmp_path):

@@ -181,9 +181,9 @@ def check_distinct(outputs: Iterable[str | Path], inputs: Iterable[str | Path | 
         taken.add(real)
 
 
-def tell_notes(scene: Scene) -> None:
-    """Print what the reader of the scene assumed or left out."""
-    for note in scene.notes:
+def tell_notes(notes: Iterable[str]) -> None:
+    """Print what was assumed or left out."""
+    for note in notes:
         print(f"note: {note}", file=sys.stderr)
 
 

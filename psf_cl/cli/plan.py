@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     from psf_cl.traits import DeviceTraits
 
     scene, settings = load_with_settings(args)
-    tell_notes(scene)
+    tell_notes(scene.notes)
     plan = make_plan(scene, settings, args.aov, DeviceTraits.of_kind(args.kind), args.crop)
     if args.json:
         print(json_text(plan.as_dict(), indent=2))

@@ -110,10 +110,12 @@ def run(args: argparse.Namespace) -> int:
     from psf_cl.renderer import Renderer
 
     if not args.quiet:
-        tell_notes(scene)
+        tell_notes(scene.notes)
     renderer = Renderer(
         scene, settings, device, outputs=args.aov, crop=args.crop, statistics=statistics
     )
+    if not args.quiet:
+        tell_notes(renderer.notes)
     # Until the files are written, Ctrl-C must not throw the picture away.
     with stop_on_interrupt() as interrupted:
         with contextlib.closing(renderer):

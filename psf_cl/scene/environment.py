@@ -46,16 +46,16 @@ def _mended(path: Path, radiance: np.ndarray) -> tuple[np.ndarray, tuple[str, ..
         return radiance, ()
     notes = []
     if dark.any():
-        notes.append(f"{path}: {dark.any(axis=-1).sum()} negative or NaN texels are set to 0.")
+        notes.append(f"{path}: {dark.any(axis=-1).sum()} negative or NaN texels are set to 0")
     if extreme.any():
         count = extreme.any(axis=-1).sum()
-        notes.append(f"{path}: {count} texels above {MAX_RADIANCE:g} are set to that.")
+        notes.append(f"{path}: {count} texels above {MAX_RADIANCE:g} are set to that")
         radiance = np.where(extreme, np.float32(MAX_RADIANCE), radiance)
     if infinite.any():
         finite = radiance[np.isfinite(radiance)]
         brightest = max(float(finite.max(initial=0.0)), 1.0)
         count = infinite.any(axis=-1).sum()
-        notes.append(f"{path}: {count} infinite texels are set to {brightest:g}.")
+        notes.append(f"{path}: {count} infinite texels are set to {brightest:g}")
         radiance = np.where(infinite, np.float32(brightest), radiance)
     return np.where(dark, np.float32(0), radiance), tuple(notes)
 

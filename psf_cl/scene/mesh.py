@@ -78,7 +78,7 @@ def _load_ply(path: Path, data: bytes) -> Scene:
         shapes=_shapes(path, [read]),
         materials=(material,),
         textures=tuple(textures),
-        notes=tuple(f"Left out: {reason}." for reason in lost),
+        notes=tuple(f"left out: {reason}" for reason in lost),
         files=(str(path), *_texture_files(path, textures)),
     )
 
@@ -214,7 +214,7 @@ def _load_obj(path: Path, data: bytes) -> Scene:
         materials.setdefault(name, known.get(name, Material(name=name)))
         shapes.append(Shape(name, mesh, np.eye(4), list(materials).index(name)))
     if unknown:
-        notes.append(f"{path}: undefined materials stay grey: {_listed(unknown)}.")
+        notes.append(f"{path}: undefined materials stay grey: {_listed(unknown)}")
     return Scene(
         path=str(path),
         shapes=tuple(shapes),
@@ -306,12 +306,12 @@ def _read_libraries(
             try:
                 text = read_file(path.parent / name).decode("utf-8", "replace")
             except InputError as error:
-                notes.append(f"Materials are left out: {error}.")
+                notes.append(f"materials are left out: {error}")
                 continue
             files.append(str(path.parent / name))
             known |= _parse_mtl(path, text, textures, lost_textures, notes)
     if lost_textures:
-        notes.append(f"{path}: textures are left out: {_listed(lost_textures)}.")
+        notes.append(f"{path}: textures are left out: {_listed(lost_textures)}")
     return known
 
 
@@ -344,7 +344,7 @@ def _parse_mtl(
                 continue
             known[name] = replace(known[name], emission=limited(color))
             if max(color) > MAX_RADIANCE:
-                notes.append(f"{path}: Ke of {name} above {MAX_RADIANCE:g} is set to that.")
+                notes.append(f"{path}: Ke of {name} above {MAX_RADIANCE:g} is set to that")
         elif name and keyword == "map_Kd" and rest:
             index = _texture_index(path, rest, textures, lost_textures)
             known[name] = replace(known[name], base_color_texture=index)

@@ -181,7 +181,7 @@ def load_toml(path: Path, load_mesh_file: Callable[[Path], Scene]) -> Scene:
     environment = _read_environment(raw.get("environment", {}), place.key("environment"), assembly)
     cameras = _read_cameras(raw, place, assembly)
     for name in assembly.overrides.keys() - assembly.used_overrides:
-        assembly.notes.append(f"Nothing in {path} uses the material {name}.")
+        assembly.notes.append(f"nothing in {path} uses the material {name}")
     return Scene(
         path=str(path),
         **film,
