@@ -1,5 +1,7 @@
-"""Scenes that others made, in the folder that $PSF_CL_SHARED_SCENES names: they render, and two of
-them look as another renderer (Tungsten) shows them."""
+"""Scenes that others made: they render, and two of them look as Tungsten shows them.
+
+They are in the folder that $PSF_CL_SHARED_SCENES names.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ import pytest
 from psf_cl.image import read_exr
 from psf_cl.measure.errors import LUMINANCE, block_agreement, block_means
 from psf_cl.renderer import Renderer
+from psf_cl.scene.environment import load_environment
 from psf_cl.scene.load import load_scene
+from psf_cl.scene.model import Environment
 from psf_cl.settings import resolve
 
 ROOT = os.environ.get("PSF_CL_SHARED_SCENES", "")
@@ -93,9 +97,6 @@ def test_veach_mis_looks_as_its_reference(device):
 
 def test_environment_of_the_living_room_comes_through_its_windows(device):
     """Lit by its sky map, turned as the file's extras say, the room is not dark."""
-    from psf_cl.scene.environment import load_environment
-    from psf_cl.scene.model import Environment
-
     folder = Path(ROOT) / "interiors"
     scene = load_scene(folder / "living-room.glb", size=(128, 128))
     image, _ = load_environment(folder / "living-room-sky.exr")

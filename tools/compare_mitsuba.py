@@ -45,8 +45,8 @@ MEAN_TOLERANCE = 0.01
 BEYOND_THREE = math.erfc(3.0 / math.sqrt(2.0))
 FAR = 6.0
 
-# Between 4 seeds, blocks whose noise comes from a few pixels showed deviations of 4.6 sigma that were
-# gone with 16.
+# Between 4 seeds, blocks whose noise comes from a few pixels showed deviations of 4.6 sigma that
+# were gone with 16.
 MIN_SEEDS = 8
 
 # Where a block has no noise (an emitter seen directly) the renderers still round differently.
@@ -86,9 +86,15 @@ class Agreement:
 
     @property
     def allowed(self) -> int:
-        """Return how many blocks may lie beyond 3 sigma by chance: binomial mean plus 3 sigma."""
+        """Return how many blocks beyond 3 sigma chance exceeds in less than one of 1,000 runs."""
         expected = self.z.size * BEYOND_THREE
-        return math.floor(expected + 3.0 * math.sqrt(expected))
+        count, term = 0, math.exp(-expected)
+        above = 1.0 - term
+        while above > 1e-3:
+            count += 1
+            term *= expected / count
+            above -= term
+        return count
 
     @property
     def passed(self) -> bool:
