@@ -4,21 +4,19 @@
 #include "common/lanes.h"
 #include "common/layout.h"
 #include "common/pool.h"
-#include "common/alpha.h"
-#include "common/traverse.h"
+#include "common/trace.h"
 
 /// Trace the shadow rays and add what arrives to their paths.
 ///
 /// Also paths that have ended may have a last one.
 ///
-/// reads   pool.{shadow, toward, light}; nodes, blocks
+/// reads   pool.{shadow, toward, light}; geometry
 /// writes  pool.radiance (direct), pool.light (cleared); counters.pending_shadow
 kernel void connect_lights(
     __global const Params *params,
-    __global const BvhNode *nodes,
-    __global const TriangleBlock *blocks,
     __global float *pool,
-    volatile __global uint *counters ALPHA_PARAMETERS)
+    volatile __global uint *counters,
+    GEOMETRY_PARAMETERS)
 {
     const uint item = get_global_id(0);
     if (item >= params->slots / W)
@@ -31,29 +29,10 @@ kernel void connect_lights(
         return;
     atomic_add(&counters[COUNTER_PENDING_SHADOW], count_lanes(wanted));
 
-    float origin[3][W];
-    float toward[3][W];
-    float lane_wanted[W];
-    for (uint c = 0; c < 3; ++c) {
-        store_lanes(FIELD(path, PATH_SHADOW_X + c), origin[c]);
-        store_lanes(FIELD(path, PATH_TOWARD_X + c), toward[c]);
-    }
-    store_lanes(pick(wanted, (Float)(1.0f), (Float)(0.0f)), lane_wanted);
-    float seen[W];
-    for (uint k = 0; k < W; ++k) {
-        seen[k] = 0.0f;
-        if (lane_wanted[k] == 0.0f)
-            continue;
-        Ray ray;
-        for (uint c = 0; c < 3; ++c) {
-            ray.origin[c] = origin[c][k];
-            ray.direction[c] = toward[c][k];
-        }
-        ray.t_max = 1.0f;
-        seen[k] = trace_any(nodes, blocks, ray ALPHA_ARGUMENTS) ? 0.0f : 1.0f;
-    }
+    const Mask blocked = blocked_rays(params, wanted, get_v(path, PATH_SHADOW_X), get_v(path, PATH_TOWARD_X),
+                                      GEOMETRY_ARGUMENTS);
     const Vec3 zero = vec3_all((Float)(0.0f));
-    const Vec3 arrives = pick_v(load_lanes(seen) > 0.0f, light, zero);
+    const Vec3 arrives = pick_v(wanted & !blocked, light, zero);
     put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), arrives));
 #if AOV_DIRECT
     // The vertex that sent the ray: the path has moved on unless it ended.

@@ -15,7 +15,7 @@ from psf_cl.scene.model import Scene, emits, has_environment, is_cut_out, shines
 from psf_cl.settings import Settings
 from psf_cl.stages import camera, connect, film, intersect, shade
 from psf_cl.stages.spec import BufferSpec, Context, Feature, StageSpec
-from psf_cl.tables import visible_shapes
+from psf_cl.tables import few_triangles, flatten, visible_shapes
 from psf_cl.traits import DeviceTraits
 
 #: Bytes that the passes in flight may take before the ring is made shorter.
@@ -132,10 +132,12 @@ def make_plan(
             f"{scene.width}x{scene.height}"
         )
 
-    features = _features(scene, settings, outputs)
-    pixel_count = width * height
     shapes = visible_shapes(scene)
     triangles = sum(len(shape.mesh.triangles) for shape in shapes)
+    corners = _few_corners(scene, triangles, traits)
+    features = _features(scene, settings, outputs)
+    features["FEW"] = _few(triangles, corners, traits)
+    pixel_count = width * height
     image = scene.environment.image
     context = Context(
         features,
@@ -144,6 +146,7 @@ def make_plan(
         _ring(pixel_count, traits, features),
         statistics=statistics,
         triangle_count=triangles,
+        corner_count=corners,
         material_count=len(scene.materials),
         texture_count=len(scene.textures),
         texel_count=sum(texture.pixels.size // 4 for texture in scene.textures),
@@ -186,6 +189,24 @@ def _ring(pixel_count: int, traits: DeviceTraits, features: dict[str, Feature]) 
     while ring < wanted and ring * 2 <= affordable:
         ring *= 2
     return ring
+
+
+def _few_corners(scene: Scene, triangles: int, traits: DeviceTraits) -> int:
+    """Return how many distinct corners a small scene has, 0 for one that is too large to ask."""
+    if triangles > traits.few_triangles:
+        return 0
+    return len(few_triangles(flatten(scene).positions).corners)
+
+
+def _few(triangles: int, corners: int, traits: DeviceTraits) -> Feature:
+    """Return whether all triangles are tested, with the room for their corners."""
+    if triangles > traits.few_triangles:
+        return Feature(0, f"a tree: {triangles} triangles")
+    if corners > traits.few_corners:
+        return Feature(0, f"a tree: {corners} corners")
+    # In steps, so that scenes of about the same size share their programs.
+    room = max(32 * -(-corners // 32), 32)
+    return Feature(room, f"no tree: {triangles} triangles between {corners} corners")
 
 
 def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict[str, Feature]:
@@ -270,11 +291,20 @@ def _scene_buffers(context: Context, scene: Scene) -> tuple[BufferSpec, ...]:
     float32, uint8 = np.dtype(np.float32), np.dtype(np.uint8)
     buffers = [
         BufferSpec("params", layout.PARAMS.dtype, 1, "camera and settings"),
-        BufferSpec("blocks", layout.TRIANGLE_BLOCK.dtype, -(-triangles // 2), "leaves (estimate)"),
-        BufferSpec("nodes", layout.BVH_NODE.dtype, -(-triangles // 6), "inner nodes (estimate)"),
         BufferSpec("surfaces", layout.SURFACE.dtype, triangles, "triangles for shading"),
         BufferSpec("materials", layout.MATERIAL.dtype, context.material_count, "materials"),
     ]
+    if context.on("FEW"):
+        buffers += [
+            BufferSpec("corners", float32, 3 * context.corner_count, "corners of all triangles"),
+            BufferSpec("faces", np.dtype(np.uint32), 4 * triangles, "triangles between them"),
+        ]
+    else:
+        block, node = layout.TRIANGLE_BLOCK.dtype, layout.BVH_NODE.dtype
+        buffers += [
+            BufferSpec("blocks", block, -(-triangles // 2), "leaves (estimate)"),
+            BufferSpec("nodes", node, -(-triangles // 6), "inner nodes (estimate)"),
+        ]
     if context.on("SMOOTH"):
         buffers.append(BufferSpec("normals", layout.NORMALS.dtype, triangles, "shading normals"))
     if context.on("TEXTURES"):

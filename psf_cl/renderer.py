@@ -81,15 +81,19 @@ class Renderer:
             self._allocate()
             geometry = self._upload_scene()
             self.load_seconds = time.perf_counter() - start
-            self.compile_seconds += warm_up_builder(self.device)
-            start = time.perf_counter()
-            self.bvh: Bvh = self._build_bvh(geometry)
-            self.build_seconds = time.perf_counter() - start
+            self.build_seconds = 0.0
+            self.bvh: Bvh | None = None
+            if not self.plan.features["FEW"].value:
+                self.compile_seconds += warm_up_builder(self.device)
+                start = time.perf_counter()
+                self.bvh = self._build_bvh(geometry)
+                self.dropped_triangles = self.bvh.dropped
+                self.build_seconds = time.perf_counter() - start
             programs = compiling.result()
         finally:
             # An error or Ctrl-C is told now, not when the compiler has come to its end.
             background.shutdown(wait=False)
-        if self.bvh.stack_size != MIN_STACK_SIZE:
+        if self.bvh is not None and self.bvh.stack_size != MIN_STACK_SIZE:
             programs = self._compile(self.bvh.stack_size)
         self._bind(programs)
 
@@ -241,9 +245,11 @@ class Renderer:
             "occupancy": self._occupancy(),
             "counters": {
                 "rejected_samples": int(counters[layout.COUNTER_INDEX["rejected_samples"]]),
-                "dropped_triangles": self.bvh.dropped,
+                "dropped_triangles": self.dropped_triangles,
             },
-            "bvh": {
+            "bvh": None
+            if self.bvh is None
+            else {
                 "nodes": self.bvh.node_count,
                 "blocks": self.bvh.block_count,
                 "depth": self.bvh.depth,
@@ -257,9 +263,9 @@ class Renderer:
     @property
     def notes(self) -> tuple[str, ...]:
         """What a user should know that only building the scene has shown, one sentence each."""
-        if not self.bvh.dropped:
+        if not self.dropped_triangles:
             return ()
-        return (f"{self.bvh.dropped} triangles are left out: a coordinate is not finite",)
+        return (f"{self.dropped_triangles} triangles are left out: a coordinate is not finite",)
 
     def close(self) -> None:
         """Give the device memory back."""
@@ -292,11 +298,17 @@ class Renderer:
         geometry = tables.flatten(scene)
         lights, environment_pmf = tables.light_table(scene, geometry, self.settings.light_sampling)
         textures, texels = tables.texture_tables(scene.textures if "textures" in planned else ())
+        few = None
+        if self.plan.features["FEW"].value:
+            few = tables.few_triangles(geometry.positions, self._cut_out(geometry))
+        self.dropped_triangles = few.dropped if few else 0
         uvs = (
             geometry.uvs if geometry.uvs is not None else np.zeros(geometry.count, layout.UVS.dtype)
         )
         contents = {
-            "params": lambda: self._params(geometry, len(lights), environment_pmf),
+            "params": lambda: self._params(geometry, few, len(lights), environment_pmf),
+            "corners": lambda: few.corners.reshape(-1),
+            "faces": lambda: few.faces.reshape(-1),
             "surfaces": lambda: geometry.surfaces,
             "materials": lambda: tables.material_table(scene.materials),
             "normals": lambda: geometry.normals,
@@ -313,7 +325,11 @@ class Renderer:
         return geometry
 
     def _params(
-        self, geometry: tables.Geometry, light_count: int, environment_pmf: float
+        self,
+        geometry: tables.Geometry,
+        few: tables.Few | None,
+        light_count: int,
+        environment_pmf: float,
     ) -> np.ndarray:
         scene, settings = self.scene, self.settings
         params = np.zeros(1, layout.PARAMS.dtype)
@@ -333,6 +349,8 @@ class Renderer:
             if settings.termination == "roulette"
             else 0xFFFFFFFF,
             "light_count": light_count,
+            "corner_count": len(few.corners) if few else 0,
+            "face_count": len(few.faces) if few else 0,
             "environment_width": 1 if image is None else image.shape[1],
             "environment_height": 1 if image is None else image.shape[0],
             "environment_radiance": scene.environment.radiance,
@@ -346,13 +364,18 @@ class Renderer:
             params[0][name] = value
         return params
 
+    def _cut_out(self, geometry: tables.Geometry) -> np.ndarray:
+        """Return which triangles' alpha must be looked up, ``(n,)`` bool."""
+        cut_out = np.array([is_cut_out(m) for m in self.scene.materials], bool)
+        return cut_out[geometry.surfaces["material"]]
+
     def _build_bvh(self, geometry: tables.Geometry) -> Bvh:
         device = self.device
         inputs = [device.upload("positions", geometry.positions.reshape(-1))]
         try:
             if self.plan.features["ALPHA"].value:
-                cut_out = np.array([is_cut_out(m) for m in self.scene.materials], np.uint32)
-                inputs.append(device.upload("alpha_flags", cut_out[geometry.surfaces["material"]]))
+                flags = self._cut_out(geometry).astype(np.uint32)
+                inputs.append(device.upload("alpha_flags", flags))
             bvh = build_bvh(device, inputs[0], geometry.count, *inputs[1:])
         finally:
             device.release(*inputs)

@@ -15,6 +15,8 @@ class DeviceTraits:
         block: paths of one block of the pool; a multiple of ``lanes``.
         slots: paths in flight; a multiple of ``block``.
         group: work items of a work group.
+        few_triangles, few_corners: scenes up to this size are traced without a tree, all triangles
+            in lanes; 0 for never.
     """
 
     kind: str
@@ -22,6 +24,8 @@ class DeviceTraits:
     block: int
     slots: int
     group: int
+    few_triangles: int = 0
+    few_corners: int = 0
 
     def __post_init__(self) -> None:
         if self.lanes not in (1, 8, 16) or self.block % self.lanes or self.slots % self.block:
@@ -38,5 +42,5 @@ class DeviceTraits:
         path a work item, blocks of 32 so that neighbours read neighbouring words.
         """
         if kind == "cpu":
-            return cls("cpu", lanes=16, block=16, slots=1 << 15, group=8)
+            return cls("cpu", lanes=16, block=16, slots=1 << 15, group=8, few_triangles=160, few_corners=128)
         return cls("gpu", lanes=1, block=32, slots=1 << 18, group=64)

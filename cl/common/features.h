@@ -37,3 +37,6 @@
 #ifndef AOV_FEATURES
 #error "AOV_FEATURES must be 0 or 1"
 #endif
+#ifndef FEW
+#error "FEW must be 0 (a tree), or the most corners of the list of triangles"
+#endif

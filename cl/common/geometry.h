@@ -10,6 +10,7 @@
 // Woop, Benthin, Wald: Watertight Ray/Triangle Intersection, JCGT 2 (1), 2013.
 #pragma once
 
+#include "lanes.h"
 #include "layout.h"
 
 #define BOX_SLACK 0x1p-21f // 8 u: 6 for the corners, 2 for the rounding of slack and sum
@@ -17,13 +18,6 @@
 // At least 1 + 2 gamma(3): the far distance of a box must not be rounded below its near distance.
 // Ize: Robust BVH Ray Traversal, JCGT 2 (2), 2013.
 #define BOX_FAR_FACTOR 0x1.000008p0f
-
-/// A ray; the direction need not be unit, t counts in its lengths.
-typedef struct {
-    float origin[3];
-    float direction[3];
-    float t_max; // hits are in (0, t_max)
-} Ray;
 
 /// What a ray hits first.
 typedef struct {
@@ -33,7 +27,7 @@ typedef struct {
     uint triangle; // index without ALPHA_BIT, or NO_HIT
 } Hit;
 
-/// What depends on the ray alone.
+/// What depends on the ray alone: boxes' rows and planes, and the shear that turns the ray into z.
 typedef struct {
     float near_origin[3]; // the origin, moved back by its slack
     float far_origin[3]; // the origin, moved on
@@ -45,6 +39,17 @@ typedef struct {
     float t_max; // 0 if the ray is beyond 2^120, not finite or has no direction: no hits
 } RaySetup;
 
+/// The same of all lanes.
+typedef struct {
+    float near_origin[3][W];
+    float far_origin[3][W];
+    float inverse[3][W];
+    uint axis[W]; // kz
+    float origin[3][W];
+    float shear[3][W];
+    float t_max[W];
+} RaySetups;
+
 /// Four triangles' answers; lane k holds only where hit[k] is -1.
 typedef struct {
     int4 hit;
@@ -53,42 +58,82 @@ typedef struct {
     float4 v;
 } BlockHit;
 
-static inline RaySetup make_ray_setup(const Ray ray)
+/// Set up the rays of the lanes in `active`; the others' t_max is 0.
+static inline void set_up_rays(RaySetups *rays, Mask active, Vec3 origin, Vec3 direction, Float t_max)
 {
-    RaySetup setup;
-    const float x = fabs(ray.direction[0]);
-    const float y = fabs(ray.direction[1]);
-    const float z = fabs(ray.direction[2]);
-    const float longest = max(x, max(y, z));
-    const float reach = max(fabs(ray.origin[0]), max(fabs(ray.origin[1]), fabs(ray.origin[2])));
+    const Float x = fabs(direction.x);
+    const Float y = fabs(direction.y);
+    const Float z = fabs(direction.z);
+    const Float longest = max(x, max(y, z));
+    const Float reach = max(fabs(origin.x), max(fabs(origin.y), fabs(origin.z)));
     // Sums, because max() may drop a NaN; the limits keep every inverse away from 0.
-    const bool usable = x + y + z < 0x1p120f && longest > 0x1p-120f
-        && fabs(ray.origin[0]) + fabs(ray.origin[1]) + fabs(ray.origin[2]) < 0x1p120f;
-    setup.t_max = usable ? ray.t_max : 0.0f;
+    const Mask usable = active & (x + y + z < 0x1p120f) & (longest > 0x1p-120f)
+                        & (fabs(origin.x) + fabs(origin.y) + fabs(origin.z) < 0x1p120f);
+    store_lanes(pick(usable, t_max, (Float)(0.0f)), rays->t_max);
 
-    for (uint axis = 0; axis < 3; ++axis) {
-        const float inverse = 1.0f / ray.direction[axis];
-        const bool backward = inverse < 0.0f;
-        const float slack = backward ? -BOX_SLACK * reach : BOX_SLACK * reach;
-        setup.inverse[axis] = inverse;
-        setup.near_row[axis] = 2 * axis + (backward ? 1 : 0);
-        setup.near_origin[axis] = ray.origin[axis] + slack;
-        setup.far_origin[axis] = ray.origin[axis] - slack;
-    }
+    const Float slack = BOX_SLACK * reach;
+    const Vec3 inverse = vec3(1.0f / direction.x, 1.0f / direction.y, 1.0f / direction.z);
+    const Float slack_x = pick(inverse.x < 0.0f, -slack, slack);
+    const Float slack_y = pick(inverse.y < 0.0f, -slack, slack);
+    const Float slack_z = pick(inverse.z < 0.0f, -slack, slack);
+    store_lanes(inverse.x, rays->inverse[0]);
+    store_lanes(inverse.y, rays->inverse[1]);
+    store_lanes(inverse.z, rays->inverse[2]);
+    store_lanes(origin.x + slack_x, rays->near_origin[0]);
+    store_lanes(origin.y + slack_y, rays->near_origin[1]);
+    store_lanes(origin.z + slack_z, rays->near_origin[2]);
+    store_lanes(origin.x - slack_x, rays->far_origin[0]);
+    store_lanes(origin.y - slack_y, rays->far_origin[1]);
+    store_lanes(origin.z - slack_z, rays->far_origin[2]);
 
     // The winding that Woop et al. keep by swapping kx and ky does not matter without culling.
-    const uint kz = x > y ? (x > z ? 0u : 2u) : (y > z ? 1u : 2u);
+    const Mask along_x = (x > y) & (x > z);
+    const Mask along_y = !along_x & (y > z) & (x <= y);
+    const Vec3 o = pick_v(along_x, vec3(origin.y, origin.z, origin.x),
+                          pick_v(along_y, vec3(origin.z, origin.x, origin.y), origin));
+    const Vec3 d = pick_v(along_x, vec3(direction.y, direction.z, direction.x),
+                          pick_v(along_y, vec3(direction.z, direction.x, direction.y), direction));
+    store_lanes_u(pick_u(along_x, (UInt)(0u), pick_u(along_y, (UInt)(1u), (UInt)(2u))), rays->axis);
+    store_lanes(o.x, rays->origin[0]);
+    store_lanes(o.y, rays->origin[1]);
+    store_lanes(o.z, rays->origin[2]);
+    store_lanes(d.x / d.z, rays->shear[0]);
+    store_lanes(d.y / d.z, rays->shear[1]);
+    store_lanes(1.0f / d.z, rays->shear[2]);
+}
+
+// Loops over axes are written out in what every ray runs: PoCL keeps short loops, and their arrays in
+// memory.
+
+/// The setup of lane `k`.
+static inline RaySetup ray_setup(const RaySetups *rays, uint k)
+{
+    RaySetup ray;
+    ray.near_origin[0] = rays->near_origin[0][k];
+    ray.near_origin[1] = rays->near_origin[1][k];
+    ray.near_origin[2] = rays->near_origin[2][k];
+    ray.far_origin[0] = rays->far_origin[0][k];
+    ray.far_origin[1] = rays->far_origin[1][k];
+    ray.far_origin[2] = rays->far_origin[2][k];
+    ray.inverse[0] = rays->inverse[0][k];
+    ray.inverse[1] = rays->inverse[1][k];
+    ray.inverse[2] = rays->inverse[2][k];
+    ray.near_row[0] = ray.inverse[0] < 0.0f ? 1u : 0u;
+    ray.near_row[1] = ray.inverse[1] < 0.0f ? 3u : 2u;
+    ray.near_row[2] = ray.inverse[2] < 0.0f ? 5u : 4u;
+    const uint kz = rays->axis[k];
     const uint kx = kz == 2u ? 0u : kz + 1u;
-    const uint ky = kx == 2u ? 0u : kx + 1u;
-    setup.axis[0] = kx;
-    setup.axis[1] = ky;
-    setup.axis[2] = kz;
-    for (uint k = 0; k < 3; ++k)
-        setup.origin[k] = ray.origin[setup.axis[k]];
-    setup.shear[0] = ray.direction[kx] / ray.direction[kz];
-    setup.shear[1] = ray.direction[ky] / ray.direction[kz];
-    setup.shear[2] = 1.0f / ray.direction[kz];
-    return setup;
+    ray.axis[0] = kx;
+    ray.axis[1] = kx == 2u ? 0u : kx + 1u;
+    ray.axis[2] = kz;
+    ray.origin[0] = rays->origin[0][k];
+    ray.origin[1] = rays->origin[1][k];
+    ray.origin[2] = rays->origin[2][k];
+    ray.shear[0] = rays->shear[0][k];
+    ray.shear[1] = rays->shear[1][k];
+    ray.shear[2] = rays->shear[2][k];
+    ray.t_max = rays->t_max[k];
+    return ray;
 }
 
 /// a * d - b * c with the sign of the exact value (short of underflow).
@@ -184,17 +229,23 @@ static inline BlockHit intersect_block(__global const TriangleBlock *block, cons
 static inline int8 intersect_boxes(
     __global const BvhNode *node, const RaySetup *ray, float limit, float8 *entry)
 {
+    const uint x = ray->near_row[0];
+    const uint y = ray->near_row[1];
+    const uint z = ray->near_row[2];
+    const float8 x0 = (vload8(0, node->bounds[x]) - ray->near_origin[0]) * ray->inverse[0];
+    const float8 x1 = (vload8(0, node->bounds[x ^ 1u]) - ray->far_origin[0]) * ray->inverse[0];
+    const float8 y0 = (vload8(0, node->bounds[y]) - ray->near_origin[1]) * ray->inverse[1];
+    const float8 y1 = (vload8(0, node->bounds[y ^ 1u]) - ray->far_origin[1]) * ray->inverse[1];
+    const float8 z0 = (vload8(0, node->bounds[z]) - ray->near_origin[2]) * ray->inverse[2];
+    const float8 z1 = (vload8(0, node->bounds[z ^ 1u]) - ray->far_origin[2]) * ray->inverse[2];
     float8 near = (float8)(0.0f);
     float8 far = (float8)(limit);
-    for (uint axis = 0; axis < 3; ++axis) {
-        const uint row = ray->near_row[axis];
-        const float8 near_bound = vload8(0, node->bounds[row]);
-        const float8 far_bound = vload8(0, node->bounds[row ^ 1u]);
-        const float8 enter = (near_bound - ray->near_origin[axis]) * ray->inverse[axis];
-        const float8 leave = (far_bound - ray->far_origin[axis]) * ray->inverse[axis];
-        near = enter > near ? enter : near;
-        far = leave < far ? leave : far;
-    }
+    near = x0 > near ? x0 : near;
+    near = y0 > near ? y0 : near;
+    near = z0 > near ? z0 : near;
+    far = x1 < far ? x1 : far;
+    far = y1 < far ? y1 : far;
+    far = z1 < far ? z1 : far;
     *entry = near;
     return near <= far * BOX_FAR_FACTOR;
 }

@@ -109,7 +109,8 @@ typedef struct {
     float scene_radius; // m, of the bounding sphere
     uint direct_sampling; // DIRECT_MIS, DIRECT_LIGHT or DIRECT_BSDF
     uint sampler; // SAMPLER_SOBOL or SAMPLER_RANDOM
-    uint pad; // fills the record
+    uint corner_count; // of the list of corners, where all triangles are tested
+    uint face_count; // triangles between those corners
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "geometry.h"
+#include "lanes.h"
 
 #ifndef ALPHA
 #define ALPHA 0
@@ -10,6 +11,8 @@
 #define ALPHA_PARAMETERS
 #define ALPHA_ARGUMENTS
 #endif
+#if !FEW
+
 #ifndef STACK_SIZE
 #error "STACK_SIZE must be that of the tree: 7 entries a level and one more"
 #endif
@@ -21,8 +24,32 @@
 #define IS_THERE(id, u, v) true
 #endif
 
-/// Return the first hit of a ray that is set up; of equally near ones that of the lowest index.
-static inline Hit trace_closest_setup(
+/// Bit k of the result is set where lane k of `mask` is -1.
+static inline uint bits_of_4(int4 mask)
+{
+#ifdef __SSE__
+    // Measured: one instruction in place of four tests saves up to a tenth of a traversal.
+    return (uint)__builtin_ia32_movmskps(as_float4(mask));
+#else
+    const int4 bits = mask & (int4)(1, 2, 4, 8);
+    return (uint)(bits.x | bits.y | bits.z | bits.w);
+#endif
+}
+
+static inline uint bits_of_8(int8 mask)
+{
+#ifdef __AVX__
+    return (uint)__builtin_ia32_movmskps256(as_float8(mask));
+#else
+    return bits_of_4(mask.lo) | bits_of_4(mask.hi) << 4;
+#endif
+}
+
+/// Index of the lowest set bit; `bits` is not 0.
+static inline uint lowest_bit(uint bits) { return popcount((bits - 1u) & ~bits); }
+
+/// Return the first hit of a ray; of equally near ones that of the lowest index.
+static inline Hit trace_closest(
     __global const BvhNode *nodes,
     __global const TriangleBlock *blocks,
     const RaySetup *ray ALPHA_PARAMETERS)
@@ -35,62 +62,81 @@ static inline Hit trace_closest_setup(
     best.triangle = 0;
     uint waiting[STACK_SIZE];
     float entered[STACK_SIZE];
-    waiting[0] = 0;
-    entered[0] = 0.0f;
-    uint count = ray->t_max > 0.0f ? 1 : 0;
-    while (count > 0) {
-        --count;
-        // Not where it is equal: of equally near triangles the lowest index wins.
-        if (entered[count] > best.t)
-            continue;
-        const uint next = waiting[count];
+    uint count = 0;
+    uint next = 0;
+    bool more = ray->t_max > 0.0f;
+    while (more) {
+        uint met;
         if (next & LEAF_BIT) {
+            met = 0;
             __global const TriangleBlock *block = &blocks[next & ~LEAF_BIT];
             const BlockHit found = intersect_block(block, ray);
-            if (!any(found.hit))
+            uint nearer = bits_of_4(found.hit & (found.t <= best.t));
+            if (nearer) {
+                float t[4];
+                float u[4];
+                float v[4];
+                vstore4(found.t, 0, t);
+                vstore4(found.u, 0, u);
+                vstore4(found.v, 0, v);
+                do {
+                    const uint k = lowest_bit(nearer);
+                    nearer &= nearer - 1u;
+                    const uint id = block->id[k];
+                    const uint triangle = id & ~ALPHA_BIT;
+                    if ((t[k] < best.t || (t[k] == best.t && triangle < best.triangle))
+                        && IS_THERE(id, u[k], v[k])) {
+                        best.t = t[k];
+                        best.u = u[k];
+                        best.v = v[k];
+                        best.triangle = triangle;
+                    }
+                } while (nearer);
+            }
+        } else {
+            __global const BvhNode *node = &nodes[next];
+            float8 near;
+            met = bits_of_8(intersect_boxes(node, ray, best.t, &near));
+            if (met) {
+                // The nearest child is next; the others wait, the nearest of them on top.
+                float entry[8];
+                vstore8(near, 0, entry);
+                uint k = lowest_bit(met);
+                met &= met - 1u;
+                next = node->child[k];
+                float nearest = entry[k];
+                const uint base = count;
+                while (met && count < STACK_SIZE) {
+                    k = lowest_bit(met);
+                    met &= met - 1u;
+                    uint child = node->child[k];
+                    float at = entry[k];
+                    if (at < nearest) {
+                        const uint other = next;
+                        const float farther = nearest;
+                        next = child;
+                        nearest = at;
+                        child = other;
+                        at = farther;
+                    }
+                    uint place = count++;
+                    while (place > base && entered[place - 1] < at) {
+                        entered[place] = entered[place - 1];
+                        waiting[place] = waiting[place - 1];
+                        --place;
+                    }
+                    entered[place] = at;
+                    waiting[place] = child;
+                }
                 continue;
-            int hit[4];
-            float t[4];
-            float u[4];
-            float v[4];
-            vstore4(found.hit, 0, hit);
-            vstore4(found.t, 0, t);
-            vstore4(found.u, 0, u);
-            vstore4(found.v, 0, v);
-            for (uint k = 0; k < 4; ++k) {
-                const uint id = block->id[k];
-                const uint triangle = id & ~ALPHA_BIT;
-                if (hit[k] && (t[k] < best.t || (t[k] == best.t && triangle < best.triangle))
-                    && IS_THERE(id, u[k], v[k])) {
-                    best.t = t[k];
-                    best.u = u[k];
-                    best.v = v[k];
-                    best.triangle = triangle;
-                }
             }
-            continue;
         }
-
-        __global const BvhNode *node = &nodes[next];
-        float8 near;
-        const int8 met = intersect_boxes(node, ray, best.t, &near);
-        int hit[8];
-        float entry[8];
-        vstore8(met, 0, hit);
-        vstore8(near, 0, entry);
-        const uint base = count;
-        for (uint k = 0; k < 8; ++k) {
-            if (hit[k] && count < STACK_SIZE) {
-                // Keep the nearest on top.
-                uint place = count++;
-                while (place > base && entered[place - 1] < entry[k]) {
-                    entered[place] = entered[place - 1];
-                    waiting[place] = waiting[place - 1];
-                    --place;
-                }
-                entered[place] = entry[k];
-                waiting[place] = node->child[k];
-            }
+        // Not where it is equal: of equally near triangles the lowest index wins.
+        more = false;
+        while (count > 0 && !more) {
+            --count;
+            more = entered[count] <= best.t;
+            next = waiting[count];
         }
     }
     if (!(best.t < ray->t_max))
@@ -99,7 +145,7 @@ static inline Hit trace_closest_setup(
 }
 
 /// Return whether anything lies on the ray before its t_max.
-static inline bool trace_any_setup(
+static inline bool trace_any(
     __global const BvhNode *nodes,
     __global const TriangleBlock *blocks,
     const RaySetup *ray ALPHA_PARAMETERS)
@@ -113,53 +159,35 @@ static inline bool trace_any_setup(
         if (next & LEAF_BIT) {
             __global const TriangleBlock *block = &blocks[next & ~LEAF_BIT];
             const BlockHit found = intersect_block(block, ray);
-            const int4 before = found.hit & (found.t < ray->t_max);
-            if (!any(before))
-                continue;
+            uint before = bits_of_4(found.hit & (found.t < ray->t_max));
 #if ALPHA
-            int hit[4];
+            if (!before)
+                continue;
             float u[4];
             float v[4];
-            vstore4(before, 0, hit);
             vstore4(found.u, 0, u);
             vstore4(found.v, 0, v);
-            for (uint k = 0; k < 4; ++k)
-                blocked |= hit[k] && IS_THERE(block->id[k], u[k], v[k]);
+            while (before && !blocked) {
+                const uint k = lowest_bit(before);
+                before &= before - 1u;
+                blocked = IS_THERE(block->id[k], u[k], v[k]);
+            }
 #else
-            blocked = true;
+            blocked = before != 0;
 #endif
             continue;
         }
 
         __global const BvhNode *node = &nodes[next];
         float8 near;
-        const int8 met = intersect_boxes(node, ray, ray->t_max, &near);
-        int hit[8];
-        vstore8(met, 0, hit);
-        for (uint k = 0; k < 8; ++k) {
-            if (hit[k] && count < STACK_SIZE)
-                waiting[count++] = node->child[k];
+        uint met = bits_of_8(intersect_boxes(node, ray, ray->t_max, &near));
+        while (met && count < STACK_SIZE) {
+            const uint k = lowest_bit(met);
+            met &= met - 1u;
+            waiting[count++] = node->child[k];
         }
     }
     return blocked;
 }
 
-/// As trace_closest_setup, for a ray as it is.
-static inline Hit trace_closest(
-    __global const BvhNode *nodes,
-    __global const TriangleBlock *blocks,
-    const Ray ray ALPHA_PARAMETERS)
-{
-    const RaySetup setup = make_ray_setup(ray);
-    return trace_closest_setup(nodes, blocks, &setup ALPHA_ARGUMENTS);
-}
-
-/// As trace_any_setup, for a ray as it is.
-static inline bool trace_any(
-    __global const BvhNode *nodes,
-    __global const TriangleBlock *blocks,
-    const Ray ray ALPHA_PARAMETERS)
-{
-    const RaySetup setup = make_ray_setup(ray);
-    return trace_any_setup(nodes, blocks, &setup ALPHA_ARGUMENTS);
-}
+#endif

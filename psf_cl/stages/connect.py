@@ -13,7 +13,7 @@ def plan(context: Context) -> StageSpec | None:
         "connect",
         "sampled lights need to be seen",
         "connect.cl",
-        flags=("ALPHA", "AOV_DIRECT"),
+        flags=("FEW", "ALPHA", "AOV_DIRECT"),
         kernels=("connect_lights",),
         traces=True,
     )

@@ -11,7 +11,7 @@ def plan(context: Context) -> StageSpec:
         "intersect",
         "every ray needs its closest hit",
         "intersect.cl",
-        flags=("ALPHA",),
+        flags=("FEW", "ALPHA",),
         kernels=("intersect_closest",),
         traces=True,
     )
