@@ -191,13 +191,13 @@ static inline BlockHit intersect_block(__global const TriangleBlock *block, cons
     const int4 used = vload4(0, block->id) != (uint4)(NO_HIT);
     BlockHit found;
     found.hit = used & ~signs_differ(u, v, w);
-    if (!any(found.hit))
+    if (!ANY(found.hit))
         return found;
 
     float4 determinant = u + v + w;
     const int4 doubtful = (u == 0.0f) | (v == 0.0f) | (w == 0.0f)
         | ~((fabs(determinant) > 0x1p-100f) & (fabs(determinant) < 0x1p100f));
-    if (any(found.hit & doubtful)) {
+    if (ANY(found.hit & doubtful)) {
         const float4 scale = power_of_two_scale(ax, bx, cx, ay, by, cy);
         ax *= scale;
         bx *= scale;
