@@ -142,7 +142,8 @@ kernel void regenerate_paths(
         const UInt seed = pixel_seed(y * params->width + x, params->seed);
         Float u1;
         Float u2;
-        sample_pair(seed, sample, (UInt)(PAIR_PIXEL), params->sampler, &u1, &u2);
+        const UInt index = reverse_bits(sample);
+        sample_pair(seed, index, (UInt)(PAIR_PIXEL), params->sampler, &u1, &u2);
         const Float film_x =
             ((to_float(x) + u1) * (2.0f / (float)params->width) - 1.0f) * params->film_scale_x;
         const Float film_y =
@@ -154,7 +155,7 @@ kernel void regenerate_paths(
             add_scaled(add_scaled(vec3_of(params->camera_forward), right, film_x), up, film_y);
 #if LENS
         // The point that is sharp stays where it is; the origin moves over the lens (Shirley's map).
-        sample_pair(seed, sample, (UInt)(PAIR_LENS), params->sampler, &u1, &u2);
+        sample_pair(seed, index, (UInt)(PAIR_LENS), params->sampler, &u1, &u2);
         Float c;
         Float s;
         cos_sin_turns(u2, &c, &s);

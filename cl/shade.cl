@@ -173,10 +173,12 @@ kernel void shade_paths(
     b.base_color = textured(hit, b.base_color, GATHER_U(materials, s.material, base_color_texture), triangle, u,
                             v, uvs, textures, texels, srgb_to_linear);
 #endif
+#if GLOSSY
     b.metallic = GATHER(materials, s.material, metallic);
     b.alpha = max(GATHER(materials, s.material, alpha_ggx), ALPHA_GGX_MIN);
     b.f0 = GATHER(materials, s.material, f0);
     b.specular = GATHER(materials, s.material, specular);
+#endif
 #if TRANSMISSION
     b.transmission = GATHER(materials, s.material, transmission);
     const Float ior = GATHER(materials, s.material, ior);
@@ -208,12 +210,11 @@ kernel void shade_paths(
     // The seed names the pixel by its place on the film; it travels with the path.
     const UInt seed = get_u(path, PATH_SEED);
     const UInt pair = PAIR_VERTEX + depth * VERTEX_PAIRS;
+    const UInt index = reverse_bits(sample);
     UInt lobe_bits;
     UInt light_bits;
-    sample_bits(seed, sample, pair + PAIR_CHOICE, params->sampler, &lobe_bits, &light_bits);
-    Float u_roulette;
-    Float u_alias;
-    sample_pair(seed, sample, pair + PAIR_ROULETTE, params->sampler, &u_roulette, &u_alias);
+    sample_bits(seed, index, pair + PAIR_CHOICE, params->sampler, &lobe_bits, &light_bits);
+    const Float u_lobe = unit_float(lobe_bits);
 
 #if CONNECT
     if (params->light_count > 0u) {
@@ -226,7 +227,7 @@ kernel void shade_paths(
 #if ENVIRONMENT == 2
                                                environment,
 #endif
-                                               goes_on, above, seed, sample, pair, light_bits, u_alias);
+                                               goes_on, above, seed, index, pair, light_bits);
         const Vec3 wi_local = vec3(dot3(tangent, light.wi), dot3(bitangent, light.wi), dot3(s.ns, light.wi));
         Float pdf;
         const Vec3 f = eval_bsdf(b, chances, wo_local, wi_local, dot3(s.ng, light.wi), &pdf);
@@ -248,9 +249,9 @@ kernel void shade_paths(
 
     Float u1;
     Float u2;
-    sample_pair(seed, sample, pair + PAIR_BSDF, params->sampler, &u1, &u2);
-    const Vec3 drawn = sample_bsdf(b, chances, wo_local, unit_float(lobe_bits), u1, u2);
-    const Vec3 wi = normalize3(
+    sample_pair(seed, index, pair + PAIR_BSDF, params->sampler, &u1, &u2);
+    const Vec3 drawn = sample_bsdf(b, chances, wo_local, u_lobe, u1, u2);
+    const Vec3 wi = renormalize3(
         add_scaled(add_scaled(scale(tangent, drawn.x), bitangent, drawn.y), s.ns, drawn.z));
     Float pdf;
     const Vec3 f = eval_bsdf(b, chances, wo_local, drawn, dot3(s.ng, wi), &pdf);
@@ -263,7 +264,7 @@ kernel void shade_paths(
 
     const Mask roulette = (depth + 1u) > params->roulette_depth;
     const Float chance = pick(roulette, min(max3(beta), (Float)(MAX_SURVIVAL)), (Float)(1.0f));
-    survives &= u_roulette < chance;
+    survives &= left_of_choice(chances, u_lobe) < chance;
     beta = scale(beta, 1.0f / pick(survives, chance, (Float)(1.0f)));
 
     put_v(path, PATH_BETA_R, beta);

@@ -236,6 +236,11 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "a mesh has shading normals",
             "no mesh has shading normals",
         ),
+        "GLOSSY": switch(
+            any(m.metallic > 0.0 or m.specular > 0.0 or m.transmission > 0.0 for m in materials),
+            "a material has a coat or is a metal",
+            "every material is matt",
+        ),
         "TRANSMISSION": switch(
             any(m.transmission > 0.0 and m.metallic < 1.0 for m in materials),
             "a material lets light through",

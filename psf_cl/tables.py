@@ -25,6 +25,10 @@ from psf_cl.scene.model import (
     shines,
 )
 
+#: What the rounding error of a point is bounded by, relative to the coordinates it is made of: the
+#: intersection subtracts, shears and divides, about eight roundings of 2^-24.
+OFFSET_EPSILON = 2.0**-20
+
 #: Chance that the light table keeps for emitters of finite size where there is also light from
 #: infinitely far: its flux through the scene says little about how much of it comes in.
 NEAR_SHARE = 0.5
@@ -79,7 +83,8 @@ def flatten(scene: Scene) -> Geometry:
             determinant = np.linalg.det(linear)
         surface["material"] = shape.material
         surface["light"] = layout.CONSTANT["NO_LIGHT"]
-        surface["flip"] = -1.0 if determinant < 0 else 1.0
+        surface["ng"] = _front_normals(surface, mirrored=determinant < 0)
+        surface["offset"] = OFFSET_EPSILON * _extent(surface)
         positions.append(corners.reshape(-1, 9))
         surfaces.append(surface)
         if smooth:
@@ -110,6 +115,23 @@ def flatten(scene: Scene) -> Geometry:
         joined(uvs, layout.UVS.dtype) if mapped else None,
         float(np.linalg.norm(high - low)) / 2,
     )
+
+
+def _front_normals(surface: np.ndarray, mirrored: bool) -> np.ndarray:
+    """Return unit normals ``(n, 3)``; (0, 0, 1) for triangles without area."""
+    with np.errstate(all="ignore"):
+        normal = np.cross(surface["e1"].astype(np.float64), surface["e2"].astype(np.float64))
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True) * (-1.0 if mirrored else 1.0)
+    normal[~np.isfinite(normal).all(axis=1)] = (0.0, 0.0, 1.0)
+    return normal
+
+
+def _extent(surface: np.ndarray) -> np.ndarray:
+    """Return the largest coordinate that a point of each triangle is made of, ``(n,)``."""
+    parts = (np.abs(surface[name]).astype(np.float64) for name in ("p0", "e1", "e2"))
+    with np.errstate(all="ignore"):
+        extent = sum(parts).max(axis=1)
+    return np.where(np.isfinite(extent), extent, 0.0)
 
 
 def _world_normals(normals: np.ndarray, linear: np.ndarray) -> np.ndarray:
@@ -310,6 +332,7 @@ def light_table(scene: Scene, geometry: Geometry, sampling: str) -> tuple[np.nda
     table["kind"][: len(triangles)] = layout.CONSTANT["LIGHT_TRIANGLE"]
     table["triangle"][: len(triangles)] = triangles
     table["area"][: len(triangles)] = area
+    _fill_triangles(table[: len(triangles)], geometry.surfaces[triangles], scene.materials)
     geometry.surfaces["light"][triangles] = np.arange(len(triangles))
     of = material[triangles]
     power[: len(triangles)] = area * radiance[of] * sided[of] * math.pi
@@ -349,6 +372,16 @@ def light_table(scene: Scene, geometry: Geometry, sampling: str) -> tuple[np.nda
     table["keep"], table["other"] = alias_table(chance)
     table["pmf"] = alias_chances(table["keep"], table["other"])
     return table, float(table["pmf"][len(triangles)]) if sky else 0.0
+
+
+def _fill_triangles(
+    rows: np.ndarray, surfaces: np.ndarray, materials: tuple[Material, ...]
+) -> None:
+    records = material_table(materials)[surfaces["material"]]
+    rows["position"], rows["e1"], rows["e2"] = surfaces["p0"], surfaces["e1"], surfaces["e2"]
+    rows["direction"], rows["offset"] = surfaces["ng"], surfaces["offset"]
+    rows["intensity"] = records["emission"]
+    rows["emission_texture"], rows["flags"] = records["emission_texture"], records["flags"]
 
 
 def _fill_punctual(row: np.void, light: Light) -> None:

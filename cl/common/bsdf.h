@@ -22,12 +22,51 @@
 
 /// Chance of each lobe and what all of them share, for one wo.
 typedef struct {
+#if GLOSSY
     Float reflect;
+#endif
 #if TRANSMISSION
     Float refract;
 #endif
     Float diffuse;
 } LobeChances;
+
+#if !GLOSSY
+// Nothing but the base: a scene of matt materials.
+
+inline LobeChances lobe_chances(Bsdf b, Float cos_o)
+{
+    LobeChances c;
+    c.diffuse = (Float)(1.0f);
+    return c;
+}
+
+inline Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Float wi_side, Float *pdf)
+{
+    const Mask above = (wi.z > 0.0f) & (wi_side > 0.0f);
+    *pdf = pick(above, wi.z * INV_PI, (Float)(0.0f));
+    return scale(b.base_color, *pdf);
+}
+
+inline Float left_of_choice(LobeChances chances, Float u_lobe) { return u_lobe; }
+#endif
+
+/// Cosine-weighted direction about z: Malley's method.
+inline Vec3 sample_cosine(Float u1, Float u2)
+{
+    const Float radius = sqrt(u1);
+    Float c;
+    Float s;
+    cos_sin_turns(u2, &c, &s);
+    return vec3(radius * c, radius * s, sqrt(max(1.0f - u1, 0.0f)));
+}
+
+#if !GLOSSY
+inline Vec3 sample_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Float u_lobe, Float u1, Float u2)
+{
+    return sample_cosine(u1, u2);
+}
+#else
 
 inline Float fifth_power_of_one_minus(Float x)
 {
@@ -232,15 +271,26 @@ LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Flo
     return pick_v(above, value, vec3_all((Float)(0.0f)));
 }
 
+/// What is left of a number in [0, 1) that has chosen the lobe: uniform in [0, 1) again.
+inline Float left_of_choice(LobeChances chances, Float u_lobe)
+{
+    const Mask diffuse = u_lobe < chances.diffuse;
+    Float low = pick(diffuse, (Float)(0.0f), chances.diffuse);
+    Float width = pick(diffuse, chances.diffuse, 1.0f - chances.diffuse);
+#if TRANSMISSION
+    const Float second = chances.diffuse + chances.reflect;
+    const Mask refract = u_lobe >= second;
+    width = pick(diffuse | refract, width, chances.reflect);
+    low = pick(refract, second, low);
+    width = pick(refract, 1.0f - second, width);
+#endif
+    return clamp((u_lobe - low) / max(width, 1e-6f), (Float)(0.0f), (Float)(0x1.fffffep-1f));
+}
+
 /// Draw wi (local); the caller evaluates it.  Returns z = 0 where the draw failed.
 LARGE_FUNCTION Vec3 sample_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Float u_lobe, Float u1, Float u2)
 {
-    // Cosine-weighted: Malley's method.
-    const Float radius = sqrt(u1);
-    Float c;
-    Float s;
-    cos_sin_turns(u2, &c, &s);
-    Vec3 wi = vec3(radius * c, radius * s, sqrt(max(1.0f - u1, 0.0f)));
+    Vec3 wi = sample_cosine(u1, u2);
     const Mask glossy = u_lobe >= chances.diffuse;
     if (!any_lane(glossy))
         return wi;
@@ -264,3 +314,4 @@ LARGE_FUNCTION Vec3 sample_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Float u_lo
 #endif
     return wi;
 }
+#endif

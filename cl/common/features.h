@@ -13,6 +13,9 @@
 #ifndef SMOOTH
 #error "SMOOTH must be 0 or 1"
 #endif
+#ifndef GLOSSY
+#error "GLOSSY must be 0 or 1"
+#endif
 #ifndef TRANSMISSION
 #error "TRANSMISSION must be 0 or 1"
 #endif

@@ -26,8 +26,9 @@ typedef JOIN(int, W) Mask;
 #define ANY(mask) any(mask)
 #ifdef __has_builtin
 #if __has_builtin(__builtin_reduce_or)
+#define REDUCE_OR(mask) __builtin_reduce_or(mask)
 #undef ANY
-#define ANY(mask) (__builtin_reduce_or(mask) != 0)
+#define ANY(mask) (REDUCE_OR(mask) != 0)
 #endif
 #endif
 
@@ -40,7 +41,8 @@ typedef JOIN(int, W) Mask;
 #endif
 
 // pick(mask, then, otherwise) for Float, pick_u for UInt, pick_m for Mask;
-// count_lanes(mask): how many; any_lane(mask): whether one; lanes_before(mask): how many lower ones a lane has.
+// count_lanes(mask): how many; any_lane(mask): whether one; lanes_before(mask): how many lower ones a lane has;
+// lane_bits(mask): bit k is set where lane k is.
 // GATHER(array, index, member): array[index].member of every lane, GATHER_U the same for uint.
 #if W == 1
 inline float pick(int mask, float then, float otherwise) { return mask ? then : otherwise; }
@@ -48,6 +50,7 @@ inline uint pick_u(int mask, uint then, uint otherwise) { return mask ? then : o
 inline int any_lane(int mask) { return mask != 0; }
 inline uint count_lanes(int mask) { return mask != 0; }
 inline uint lanes_before(int mask) { return 0; }
+inline uint lane_bits(int mask) { return mask != 0; }
 inline float to_float(uint x) { return (float)x; }
 inline uint to_uint(float x) { return (uint)x; }
 inline uint as_bits(float x) { return as_uint(x); }
@@ -65,6 +68,7 @@ inline int any_lane(Mask mask) { return ANY(mask); }
 inline Float to_float(UInt x) { return JOIN(convert_float, W)(x); }
 inline UInt to_uint(Float x) { return JOIN(convert_uint, W)(x); }
 inline UInt as_bits(Float x) { return JOIN(as_uint, W)(x); }
+inline UInt as_lanes_u(Mask x) { return JOIN(as_uint, W)(x); }
 inline Float from_bits(UInt x) { return JOIN(as_float, W)(x); }
 inline void store_lanes(Float x, float *array) { JOIN(vstore, W)(x, 0, array); }
 inline void store_lanes_u(UInt x, uint *array) { JOIN(vstore, W)(x, 0, array); }
@@ -94,17 +98,43 @@ inline uint count_lanes(Mask mask)
             (words)[(at).s8], (words)[(at).s9], (words)[(at).sa], (words)[(at).sb],                \
             (words)[(at).sc], (words)[(at).sd], (words)[(at).se], (words)[(at).sf]))
 #endif
+#if W == 8
+#define SHIFT_1(x) ((UInt)(0, (x).s0, (x).s1, (x).s2, (x).s3, (x).s4, (x).s5, (x).s6))
+#define SHIFT_2(x) ((UInt)(0, 0, (x).s0, (x).s1, (x).s2, (x).s3, (x).s4, (x).s5))
+#define SHIFT_4(x) ((UInt)(0, 0, 0, 0, (x).s0, (x).s1, (x).s2, (x).s3))
+#define LANE_BITS ((Int)(1, 2, 4, 8, 16, 32, 64, 128))
+#else
+#define SHIFT_1(x) ((UInt)(0, (x).s0, (x).s1, (x).s2, (x).s3, (x).s4, (x).s5, (x).s6, (x).s7, (x).s89ab, (x).scd, (x).se))
+#define SHIFT_2(x) ((UInt)(0, 0, (x).s01234567, (x).s89ab, (x).scd))
+#define SHIFT_4(x) ((UInt)(0, 0, 0, 0, (x).s01234567, (x).s89ab))
+#define SHIFT_8(x) ((UInt)((uint8)(0), (x).s01234567))
+#define LANE_BITS                                                                                  \
+    ((Int)(1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384, 32768))
+#endif
 inline UInt lanes_before(Mask mask)
 {
+    UInt sum = as_lanes_u(mask) & 1u;
+    sum = SHIFT_1(sum);
+    sum += SHIFT_1(sum);
+    sum += SHIFT_2(sum);
+    sum += SHIFT_4(sum);
+#if W == 16
+    sum += SHIFT_8(sum);
+#endif
+    return sum;
+}
+inline uint lane_bits(Mask mask)
+{
+#ifdef REDUCE_OR
+    return (uint)REDUCE_OR(mask & LANE_BITS);
+#else
     int lane[W];
-    uint before[W];
     JOIN(vstore, W)(mask, 0, lane);
-    uint sum = 0;
-    for (uint k = 0; k < W; ++k) {
-        before[k] = sum;
-        sum -= lane[k];
-    }
-    return load_lanes_u(before);
+    uint bits = 0;
+    for (uint k = 0; k < W; ++k)
+        bits |= lane[k] ? 1u << k : 0u;
+    return bits;
+#endif
 }
 #define WORDS_OF(array) ((uint)(sizeof(*(array)) / 4))
 #if W == 16 && defined(__AVX512F__)
@@ -120,6 +150,9 @@ inline Float gather_words(__global const float *words, UInt at) { return GATHER_
     gather_words((__global const float *)&(array)->member, (index)*WORDS_OF(array))
 #define GATHER_U(array, index, member) as_bits(GATHER(array, index, member))
 #endif
+
+/// Index of the lowest set bit; `bits` is not 0.
+inline uint lowest_bit(uint bits) { return popcount((bits - 1u) & ~bits); }
 
 #define MASK_ALL ((Mask)(-1))
 
@@ -161,9 +194,8 @@ inline Vec3 pick_v(Mask mask, Vec3 then, Vec3 otherwise)
 inline Vec3 lerp3(Vec3 a, Vec3 b, Float t) { return add_scaled(a, sub(b, a), t); }
 inline Float max3(Vec3 a) { return max(a.x, max(a.y, a.z)); }
 
-/// Unit vector along `v`, also where the square of its length would leave the range of float;
-/// (0, 0, 1) where `v` has no direction, or is too small for its reciprocal.
-inline Vec3 normalize3(Vec3 v)
+/// normalize3 where the square of the length leaves the range of float.
+LARGE_FUNCTION Vec3 normalize3_scaled(Vec3 v)
 {
     const Float largest = max(fabs(v.x), max(fabs(v.y), fabs(v.z)));
     const Mask ok = (largest >= FLT_MIN) & (largest < INFINITY);
@@ -171,6 +203,20 @@ inline Vec3 normalize3(Vec3 v)
     const Vec3 unit = scale(s, 1.0f / sqrt(dot3(s, s)));
     return pick_v(ok, unit, vec3((Float)(0.0f), (Float)(0.0f), (Float)(1.0f)));
 }
+
+/// Unit vector along `v`; (0, 0, 1) where `v` has no direction, or is too small for its reciprocal.
+inline Vec3 normalize3(Vec3 v)
+{
+    const Float length2 = dot3(v, v);
+    const Mask ok = (length2 > 0x1p-100f) & (length2 < 0x1p100f);
+    const Vec3 unit = scale(v, 1.0f / sqrt(length2));
+    if (!any_lane(!ok))
+        return unit;
+    return pick_v(ok, unit, normalize3_scaled(v));
+}
+
+/// Unit vector along `v` whose length is 1 but for rounding: a step of Newton's method.
+inline Vec3 renormalize3(Vec3 v) { return scale(v, 1.5f - 0.5f * dot3(v, v)); }
 
 /// Two unit vectors that make a right-handed frame with the unit vector `n`.
 ///

@@ -16,10 +16,14 @@ typedef struct {
     Mask extended;    // whether a BSDF sample could find this light too
 } LightSample;
 
-/// Slot of an alias table for 32 random bits and a second number; `keep` and `other` are the slot's.
+/// Slot of an alias table for 32 random bits; what is left of them is uniform in the slot.
 ///
 /// Vose: A Linear Algorithm for Generating Random Numbers with a Given Distribution, 1991.
-inline UInt alias_slot(UInt bits, uint count) { return mul_hi(bits, (UInt)(count)); }
+inline UInt alias_slot(UInt bits, uint count, Float *left)
+{
+    *left = unit_float(bits * count);
+    return mul_hi(bits, (UInt)(count));
+}
 
 inline Float power_heuristic(Float a, Float b)
 {
@@ -124,7 +128,7 @@ inline Float area_light_density(__global const Light *lights, UInt light, Float 
 
 /// Draw a light, then a direction to it, from point `p` whose ray origin is `origin`.
 ///
-/// pdf is 0 where nothing arrives.  `seed`, `sample` and `pair` (the vertex's first) name the numbers.
+/// pdf is 0 where nothing arrives.  `seed`, `reversed_index` and `pair` (the vertex's first) name the numbers.
 LARGE_FUNCTION LightSample sample_light(
     __global const Params *params,
     __global const Light *lights,
@@ -142,16 +146,16 @@ LARGE_FUNCTION LightSample sample_light(
     Mask active,
     Vec3 origin,
     UInt seed,
-    UInt sample,
+    UInt reversed_index,
     UInt pair,
-    UInt choice_bits,
-    Float alias_u)
+    UInt choice_bits)
 {
     Float u1;
     Float u2;
-    sample_pair(seed, sample, pair + PAIR_LIGHT, params->sampler, &u1, &u2);
+    sample_pair(seed, reversed_index, pair + PAIR_LIGHT, params->sampler, &u1, &u2);
 
-    UInt light = alias_slot(choice_bits, params->light_count);
+    Float alias_u;
+    UInt light = alias_slot(choice_bits, params->light_count, &alias_u);
     light = pick_u(alias_u < GATHER(lights, light, keep), light, GATHER_U(lights, light, other));
     const UInt kind = GATHER_U(lights, light, kind);
     const Float pmf = GATHER(lights, light, pmf);
@@ -167,38 +171,35 @@ LARGE_FUNCTION LightSample sample_light(
     const Mask on_triangle = active & (kind == LIGHT_TRIANGLE);
     if (any_lane(on_triangle)) {
         const UInt triangle = pick_u(on_triangle, GATHER_U(lights, light, triangle), (UInt)(0u));
-        const Vec3 p0 = vec3(GATHER(surfaces, triangle, p0[0]), GATHER(surfaces, triangle, p0[1]),
-                             GATHER(surfaces, triangle, p0[2]));
-        const Vec3 e1 = vec3(GATHER(surfaces, triangle, e1[0]), GATHER(surfaces, triangle, e1[1]),
-                             GATHER(surfaces, triangle, e1[2]));
-        const Vec3 e2 = vec3(GATHER(surfaces, triangle, e2[0]), GATHER(surfaces, triangle, e2[1]),
-                             GATHER(surfaces, triangle, e2[2]));
+        const Vec3 p0 = vec3(GATHER(lights, light, position[0]), GATHER(lights, light, position[1]),
+                             GATHER(lights, light, position[2]));
+        const Vec3 e1 = vec3(GATHER(lights, light, e1[0]), GATHER(lights, light, e1[1]),
+                             GATHER(lights, light, e1[2]));
+        const Vec3 e2 = vec3(GATHER(lights, light, e2[0]), GATHER(lights, light, e2[1]),
+                             GATHER(lights, light, e2[2]));
+        const Vec3 ng = vec3(GATHER(lights, light, direction[0]), GATHER(lights, light, direction[1]),
+                             GATHER(lights, light, direction[2]));
+        const Float area = GATHER(lights, light, area);
+        const Float away = GATHER(lights, light, offset);
         // Uniform on the triangle, without folding, so that strata stay connected.
         const Float root = sqrt(u1);
         const Float b1 = root * (1.0f - u2);
         const Float b2 = root * u2;
-        const Vec3 ng = scale(normalize3(cross3(e1, e2)), GATHER(surfaces, triangle, flip));
-        const Float area = GATHER(lights, light, area);
         Vec3 q = add_scaled(add_scaled(p0, e1, b1), e2, b2);
-        const Float side = pick(dot3(ng, sub(origin, q)) >= 0.0f, (Float)(1.0f), (Float)(-1.0f));
-        const Float extent =
-            max(fabs(p0.x) + fabs(e1.x) + fabs(e2.x),
-                max(fabs(p0.y) + fabs(e1.y) + fabs(e2.y), fabs(p0.z) + fabs(e1.z) + fabs(e2.z)));
-        q = add_scaled(q, ng, side * extent * OFFSET_EPSILON);
+        q = add_scaled(q, ng, pick(dot3(ng, sub(origin, q)) >= 0.0f, away, -away));
         const Vec3 toward = sub(q, origin);
         const Vec3 wi = normalize3(toward);
-        const UInt material = GATHER_U(surfaces, triangle, material);
-        const Mask two_sided = (GATHER_U(materials, material, flags) & MATERIAL_TWO_SIDED_EMISSION) != 0u;
+        const Mask two_sided = (GATHER_U(lights, light, flags) & MATERIAL_TWO_SIDED_EMISSION) != 0u;
         const Float cosine = -dot3(ng, wi);
         Mask lit = on_triangle & ((cosine > 0.0f) | two_sided) & (area > 0.0f);
 #if ALPHA
         // Holes of a cut-out emitter give no light; the shadow ray ends before it could find that out.
         lit &= alpha_passes_lanes(lit, triangle, b1, b2 ALPHA_ARGUMENTS);
 #endif
-        Vec3 emission = vec3(GATHER(materials, material, emission[0]), GATHER(materials, material, emission[1]),
-                             GATHER(materials, material, emission[2]));
+        Vec3 emission = vec3(GATHER(lights, light, intensity[0]), GATHER(lights, light, intensity[1]),
+                             GATHER(lights, light, intensity[2]));
 #if TEXTURES
-        emission = textured(lit, emission, GATHER_U(materials, material, emission_texture), triangle, b1,
+        emission = textured(lit, emission, GATHER_U(lights, light, emission_texture), triangle, b1,
                             b2, uvs, textures, texels, srgb_to_linear);
 #endif
         const Float pdf = pmf * dot3(toward, toward) / max(fabs(cosine) * area, 1e-30f);
@@ -215,10 +216,11 @@ LARGE_FUNCTION LightSample sample_light(
 #if ENVIRONMENT == 2
         UInt index_bits;
         UInt alias_bits;
-        sample_bits(seed, sample, pair + PAIR_ENVIRONMENT, params->sampler, &index_bits, &alias_bits);
+        sample_bits(seed, reversed_index, pair + PAIR_ENVIRONMENT, params->sampler, &index_bits, &alias_bits);
         const uint width = params->environment_width;
         const uint height = params->environment_height;
-        UInt cell = alias_slot(index_bits, width * height);
+        Float unused;
+        UInt cell = alias_slot(index_bits, width * height, &unused);
         cell = pick_u(unit_float(alias_bits) < GATHER(cells, cell, keep), cell, GATHER_U(cells, cell, other));
         // float division of indices below 2^24 is exact enough to floor: the remainder is corrected.
         UInt row = to_uint(to_float(cell) / (float)width);

@@ -9,12 +9,11 @@
 #define PAIR_PIXEL 0u
 #define PAIR_LENS 1u
 #define PAIR_VERTEX 2u
-#define VERTEX_PAIRS 5u
+#define VERTEX_PAIRS 4u
 #define PAIR_BSDF 0u
 #define PAIR_LIGHT 1u
-#define PAIR_CHOICE 2u      // which lobe; which light
-#define PAIR_ROULETTE 3u    // whether to go on; which side of the alias slot
-#define PAIR_ENVIRONMENT 4u // which texel; which side of its alias slot
+#define PAIR_CHOICE 2u      // which lobe, then whether to go on; which light
+#define PAIR_ENVIRONMENT 3u // which texel; which side of its alias slot
 
 /// Mix all bits of `x`; a bijection.  Wellons, hash-prospector: "lowbias32".
 inline UInt mix_bits(UInt x)
@@ -71,26 +70,31 @@ inline Float unit_float(UInt x) { return to_float(x >> 8) * 5.9604645e-8f; }
 inline UInt pixel_seed(UInt pixel, uint seed) { return mix_bits(pixel ^ mix_bits((UInt)(seed ^ 0x9e3779b9u))); }
 
 /// Two uniform 32-bit numbers, stratified over the samples of a pixel if the sampler is Sobol'.
-LARGE_FUNCTION void sample_bits(UInt seed, UInt index, UInt pair, uint sampler, UInt *first, UInt *second)
+///
+/// `reversed_index` is the sample's index with its bits reversed: once for all pairs of a vertex.
+LARGE_FUNCTION void sample_bits(
+    UInt seed, UInt reversed_index, UInt pair, uint sampler, UInt *first, UInt *second)
 {
     const UInt key = mix_bits(seed + pair * 0x9e3779b9u);
     if (sampler == SAMPLER_SOBOL) {
-        const UInt shuffled = reverse_bits(scramble_reversed(reverse_bits(index), key));
-        *first = reverse_bits(scramble_reversed(shuffled, mix_bits(key ^ 0x68bc21ebu)));
-        *second = reverse_bits(scramble_reversed(sobol_reversed(shuffled), mix_bits(key ^ 0x02e5be93u)));
+        const UInt shuffled = reverse_bits(scramble_reversed(reversed_index, key));
+        // Seeds of their own for both digits' scrambles: rotations of a mixed number.
+        *first = reverse_bits(scramble_reversed(shuffled, rotate(key, (UInt)(11u)) ^ 0x68bc21ebu));
+        *second =
+            reverse_bits(scramble_reversed(sobol_reversed(shuffled), rotate(key, (UInt)(22u)) ^ 0x02e5be93u));
     } else {
-        const UInt number = mix_bits(index + key);
+        const UInt number = mix_bits(reversed_index + key);
         *first = mix_bits(number ^ 0x68bc21ebu);
         *second = mix_bits(number ^ 0x02e5be93u);
     }
 }
 
 /// Two uniform numbers in [0, 1).
-inline void sample_pair(UInt seed, UInt index, UInt pair, uint sampler, Float *first, Float *second)
+inline void sample_pair(UInt seed, UInt reversed_index, UInt pair, uint sampler, Float *first, Float *second)
 {
     UInt a;
     UInt b;
-    sample_bits(seed, index, pair, sampler, &a, &b);
+    sample_bits(seed, reversed_index, pair, sampler, &a, &b);
     *first = unit_float(a);
     *second = unit_float(b);
 }

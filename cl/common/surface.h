@@ -22,19 +22,17 @@ typedef struct {
 /// Parameters of the BSDF at a point; textures are already in.
 typedef struct {
     Vec3 base_color;
+#if GLOSSY
     Float metallic;
     Float alpha;      // GGX
     Float f0;         // dielectric reflectance at normal incidence
     Float specular;   // dielectric F90
+#endif
 #if TRANSMISSION
     Float transmission;
     Float eta;        // index of the side of wi over that of wo, for a ray that goes through
 #endif
 } Bsdf;
-
-// What the rounding error of a point is bounded by, relative to the coordinates it is made of: the
-// intersection subtracts, shears and divides, about eight roundings of 2^-24.
-#define OFFSET_EPSILON 9.5367432e-7f
 
 /// Set up the point that barycentrics (u, v) of `triangle` name, seen along wo.
 LARGE_FUNCTION SurfacePoint surface_point(
@@ -60,7 +58,9 @@ LARGE_FUNCTION SurfacePoint surface_point(
     s.light = GATHER_U(surfaces, triangle, light);
     s.p = add_scaled(add_scaled(p0, e1, u), e2, v);
 
-    const Vec3 ng = scale(normalize3(cross3(e1, e2)), GATHER(surfaces, triangle, flip));
+    const Vec3 ng = vec3(GATHER(surfaces, triangle, ng[0]), GATHER(surfaces, triangle, ng[1]),
+                         GATHER(surfaces, triangle, ng[2]));
+    s.offset = GATHER(surfaces, triangle, offset);
     s.front = dot3(ng, wo) >= 0.0f;
     const Float side = pick(s.front, (Float)(1.0f), (Float)(-1.0f));
     s.ng = scale(ng, side);
@@ -81,10 +81,6 @@ LARGE_FUNCTION SurfacePoint surface_point(
     // A shading normal that wo sees from behind would make the point black: the real one serves there.
     s.ns = pick_v((length2 > 0.0f) & (dot3(ns, wo) > 1e-4f), ns, s.ng);
 #endif
-
-    const Float extent = max(fabs(p0.x) + fabs(e1.x) + fabs(e2.x),
-                             max(fabs(p0.y) + fabs(e1.y) + fabs(e2.y), fabs(p0.z) + fabs(e1.z) + fabs(e2.z)));
-    s.offset = extent * OFFSET_EPSILON;
     return s;
 }
 

@@ -45,9 +45,6 @@ static inline uint bits_of_8(int8 mask)
 #endif
 }
 
-/// Index of the lowest set bit; `bits` is not 0.
-static inline uint lowest_bit(uint bits) { return popcount((bits - 1u) & ~bits); }
-
 /// Return the first hit of a ray; of equally near ones that of the lowest index.
 static inline Hit trace_closest(
     __global const BvhNode *nodes,

@@ -108,14 +108,16 @@ TRIANGLE_BLOCK = Record(
 
 SURFACE = Record(
     "Surface",
-    "A triangle as shading needs it.",
+    "A triangle as shading needs it; one cache line.",
     _fields("""
     float p0[3] - first vertex; world, m
     uint material - index into the materials
     float e1[3] - second vertex minus first
     uint light - index into the light table, NO_LIGHT if it does not emit
     float e2[3] - third vertex minus first
-    float flip - -1 if the instance's transform mirrors the mesh, else 1
+    float offset - m along ng that clears the rounding error of a point on it
+    float ng[3] - unit normal of the front side
+    float pad - fills the record
     """),
 )
 
@@ -175,21 +177,26 @@ TEXTURE = Record(
 
 LIGHT = Record(
     "Light",
-    "An emitter of the light table.",
+    "An emitter of the light table, with all that sampling it needs; two cache lines.",
     _fields("""
     uint kind - LIGHT_TRIANGLE, LIGHT_ENVIRONMENT, LIGHT_POINT, LIGHT_SPOT or LIGHT_DIRECTIONAL
     uint triangle - index, for LIGHT_TRIANGLE
     float pmf - chance to be picked
     float keep - alias table: chance that the slot keeps its own index
-    float position[3] - world, m
+    float position[3] - world, m; of a triangle the first corner
     uint other - alias table: the index otherwise
-    float direction[3] - unit, the way the light travels
+    float direction[3] - unit, the way the light travels; of a triangle the normal of its front
     float range - m, inf for none
-    float intensity[3] - candela or lux
+    float intensity[3] - candela, lux, or a triangle's radiance
     float cos_outer - of the cone
+    float e1[3] - of a triangle, second corner minus first
     float spot_scale - 1 / (cos inner - cos outer), floored
-    float area - m^2, for LIGHT_TRIANGLE
-    float pad[2] - fills the record
+    float e2[3] - of a triangle, third corner minus first
+    float area - m^2, of a triangle
+    float offset - of a triangle, as Surface.offset
+    uint emission_texture - index, NO_TEXTURE for none
+    uint flags - of the material
+    float pad[5] - fills the record
     """),
 )
 

@@ -27,6 +27,7 @@ def plan(context: Context) -> StageSpec:
         flags=(
             "TEXTURES",
             "SMOOTH",
+            "GLOSSY",
             "TRANSMISSION",
             "AREA_LIGHTS",
             "PUNCTUAL_LIGHTS",
