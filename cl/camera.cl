@@ -60,12 +60,11 @@ kernel void regenerate_paths(
         if (any_lane(bad))
             atomic_add(&counters[COUNTER_REJECTED_SAMPLES], count_lanes(bad));
 
-        uint lane_status[W];
-        uint lane_sample[W];
+        const UInt pass = sample & ring_mask;
+        uint lane_pass[W];
         uint lane_pixel[W];
         float lane_value[3][W];
-        store_lanes_u(status, lane_status);
-        store_lanes_u(sample, lane_sample);
+        store_lanes_u(pass, lane_pass);
         store_lanes_u(pixel, lane_pixel);
         store_lanes(radiance.x, lane_value[0]);
         store_lanes(radiance.y, lane_value[1]);
@@ -77,26 +76,25 @@ kernel void regenerate_paths(
         store_lanes(direct_part.y, lane_direct[1]);
         store_lanes(direct_part.z, lane_direct[2]);
 #endif
-        // Neighbours mostly belong to one pass: one atomic for a run of them.
-        uint run = 0;
-        uint run_pass = 0;
-        for (uint k = 0; k < W; ++k) {
-            if ((lane_status[k] & STATUS_MASK) != STATUS_DONE)
-                continue;
-            const uint pass = lane_sample[k] & ring_mask;
-            const ulong at = (ulong)pass * pixel_count + lane_pixel[k];
+        for (uint left = lane_bits(done); left; left &= left - 1u) {
+            const uint k = lowest_bit(left);
+            const ulong at = (ulong)lane_pass[k] * pixel_count + lane_pixel[k];
             vstore4((float4)(lane_value[0][k], lane_value[1][k], lane_value[2][k], 1.0f), at, samples);
 #if AOV_DIRECT
             vstore4((float4)(lane_direct[0][k], lane_direct[1][k], lane_direct[2][k], 1.0f), at, direct);
 #endif
-            if (run > 0 && pass != run_pass) {
-                atomic_add(&counters[COUNTER_FINISHED + run_pass], run);
-                run = 0;
-            }
-            run_pass = pass;
-            ++run;
         }
-        atomic_add(&counters[COUNTER_FINISHED + run_pass], run);
+        // Neighbours mostly belong to one pass: one atomic for all of a pass.
+        Mask uncounted = done;
+        for (uint k = 0; k < W; ++k) {
+            const uint left = lane_bits(uncounted);
+            if (!left)
+                break;
+            const uint counted = lane_pass[lowest_bit(left)];
+            const Mask same = uncounted & (pass == counted);
+            atomic_add(&counters[COUNTER_FINISHED + counted], count_lanes(same));
+            uncounted &= !same;
+        }
     }
 
     const Mask free = done | ((status & STATUS_MASK) == STATUS_IDLE);
@@ -127,16 +125,7 @@ kernel void regenerate_paths(
         atomic_add(&counters[COUNTER_PENDING_CAMERA], count_lanes(start));
         const UInt at = pick_u(start, pixel, (UInt)(0u));
         // x in the low half, y in the high half.
-#if W == 1
-        const UInt xy = pixel_order[at];
-#else
-        uint lane_at[W];
-        uint lane_xy[W];
-        store_lanes_u(at, lane_at);
-        for (uint k = 0; k < W; ++k)
-            lane_xy[k] = pixel_order[lane_at[k]];
-        const UInt xy = load_lanes_u(lane_xy);
-#endif
+        const UInt xy = GATHER_WORD(pixel_order, at);
         const UInt x = xy & 0xffffu;
         const UInt y = xy >> 16;
         const UInt seed = pixel_seed(y * params->width + x, params->seed);

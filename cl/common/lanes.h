@@ -43,7 +43,8 @@ typedef JOIN(int, W) Mask;
 // pick(mask, then, otherwise) for Float, pick_u for UInt, pick_m for Mask;
 // count_lanes(mask): how many; any_lane(mask): whether one; lanes_before(mask): how many lower ones a lane has;
 // lane_bits(mask): bit k is set where lane k is.
-// GATHER(array, index, member): array[index].member of every lane, GATHER_U the same for uint.
+// GATHER(array, index, member): array[index].member of every lane, GATHER_U the same for uint;
+// GATHER_WORD(array, index): array[index] of uints.
 #if W == 1
 inline float pick(int mask, float then, float otherwise) { return mask ? then : otherwise; }
 inline uint pick_u(int mask, uint then, uint otherwise) { return mask ? then : otherwise; }
@@ -61,6 +62,7 @@ inline float load_lanes(const float *array) { return array[0]; }
 inline uint load_lanes_u(const uint *array) { return array[0]; }
 #define GATHER(array, index, member) ((array)[index].member)
 #define GATHER_U(array, index, member) ((array)[index].member)
+#define GATHER_WORD(array, index) ((array)[index])
 #else
 inline Float pick(Mask mask, Float then, Float otherwise) { return select(otherwise, then, mask); }
 inline UInt pick_u(Mask mask, UInt then, UInt otherwise) { return select(otherwise, then, mask); }
@@ -149,6 +151,7 @@ inline Float gather_words(__global const float *words, UInt at) { return GATHER_
 #define GATHER(array, index, member)                                                               \
     gather_words((__global const float *)&(array)->member, (index)*WORDS_OF(array))
 #define GATHER_U(array, index, member) as_bits(GATHER(array, index, member))
+#define GATHER_WORD(array, index) as_bits(gather_words((__global const float *)(array), index))
 #endif
 
 /// Index of the lowest set bit; `bits` is not 0.
