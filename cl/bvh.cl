@@ -1,20 +1,30 @@
-// The tree, built in steps: Morton codes, a binary tree over the sorted triangles, blocks of up to
-// four triangles, boxes from the bottom up, wide nodes from the top down.
+// The tree, built in steps: references in Morton order, a binary tree over them from the bottom up,
+// wide nodes from the top down, their boxes from the bottom up.
 //
-// The binary tree is implicit: its leaves are the places 0 .. count - 1 of the sorted triangles;
-// its inner nodes 0 .. count - 2 each cover the places from the node's own index to ends[node]
-// (either may be the lower one) and part after splits[node].  Node 0 is the root.  A *subtree* is
-// named by its inner node, or LEAF_BIT | place.  Subtrees of at most BLOCK_TRIANGLES triangles
-// become blocks.
+// A *reference* is a triangle and the box of it that the tree has to hold.  Node i < count of the
+// binary tree is the leaf of the i-th reference in Morton order; inner nodes follow as they are made,
+// so that children come before their parents.
 //
-// Karras: Maximizing Parallelism in the Construction of BVHs, Octrees, and k-d Trees, HPG 2012.
+// Clusters, the roots of the forest so far, keep Morton order.  Each looks for the neighbour with
+// which it would make the smallest box; where two choose each other, they become one.
+// Meister, Bittner: Parallel Locally-Ordered Clustering for Bounding Volume Hierarchy Construction,
+// TVCG 24 (3), 2018.
+//
+// Which subtrees become wide nodes and which blocks is chosen to cost least: a ray meets a box with
+// a chance proportional to its surface.
+// Ylitie, Karras, Laine: Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs,
+// HPG 2017, section 3.
 
 #include "common/geometry.h"
 
 #define BLOCK_TRIANGLES 4
-#define NODE_CHILDREN 8
+#define WIDTH 8
 #define NO_NODE 0xFFFFFFFFu
 #define GRID_BITS 21 // of the Morton grid, an axis; 3 * 21 = 63 key bits
+
+// What a ray pays for the boxes of a node and the triangles of a block.
+#define NODE_COST 1.0f
+#define BLOCK_COST 1.0f
 
 /// The corners of a box.
 typedef struct {
@@ -39,32 +49,51 @@ static inline void grow_box(Box *box, uint axis, float x)
     box->high[axis] = x > box->high[axis] ? x : box->high[axis];
 }
 
-/// Find each triangle's centre and whether all of its coordinates are finite.
+static inline float half_area(float3 size)
+{
+    return size.x * size.y + size.y * size.z + size.z * size.x;
+}
+
+/// Count the references of each triangle: one if all of its coordinates are finite, else none.
 ///
 /// reads   positions[0, 9 * triangle_count)
-/// writes  centers[3 * i + (0..2)], NaN if dropped; kept[i], 0 or 1
-kernel void prepare_triangles(
+/// writes  pieces[i]
+kernel void count_references(
     global const float *positions,
-    global float *centers,
-    global uint *kept,
+    global uint *pieces,
     const uint triangle_count)
 {
     const uint i = get_global_id(0);
     if (i >= triangle_count)
         return;
     global const float *p = positions + 9 * (size_t)i;
-    Box box = empty_box();
     uint finite = 1;
-    for (uint k = 0; k < 9; ++k) {
-        const float x = p[k];
-        finite &= fabs(x) < INFINITY ? 1 : 0;
-        grow_box(&box, k % 3, x);
+    for (uint k = 0; k < 9; ++k)
+        finite &= fabs(p[k]) < INFINITY ? 1 : 0;
+    pieces[i] = finite;
+}
+
+/// Box the references.
+///
+/// reads   positions; triangles[0, count)
+/// writes  references[6 * i + (0..5)]: low x, y, z, high x, y, z
+kernel void box_references(
+    global const float *positions,
+    global const uint *triangles,
+    global float *references,
+    const uint count)
+{
+    const uint i = get_global_id(0);
+    if (i >= count)
+        return;
+    global const float *p = positions + 9 * (size_t)triangles[i];
+    Box box = empty_box();
+    for (uint k = 0; k < 9; ++k)
+        grow_box(&box, k % 3, p[k]);
+    for (uint axis = 0; axis < 3; ++axis) {
+        references[6 * (size_t)i + axis] = box.low[axis];
+        references[6 * (size_t)i + 3 + axis] = box.high[axis];
     }
-    kept[i] = finite;
-    // Halves first: the sum of the two may be out of range.
-    for (uint axis = 0; axis < 3; ++axis)
-        centers[3 * (size_t)i + axis] =
-            finite ? 0.5f * box.low[axis] + 0.5f * box.high[axis] : NAN;
 }
 
 /// Put two 0 bits before each of the low 21 bits.
@@ -78,398 +107,458 @@ static inline ulong spread_bits(ulong x)
     return x;
 }
 
-/// Code the centres of the kept triangles on a cubic grid over their bounds.
+/// Return where a coordinate is in the scene, whose largest extent is 1.
+static inline float in_frame(global const float *frame, uint axis, float x)
+{
+    // Halves: the difference of the two may be out of range.
+    return (0.5f * x - 0.5f * frame[axis]) * frame[3];
+}
+
+/// Code the centres of the references on a cubic grid over the scene.
 ///
-/// reads   centers; triangles[0, count), the kept ones; bounds, of the centres
-/// writes  codes[0, count)
+/// reads   references[0, 6 * count); frame: low x, y, z of the scene and 2 / its largest extent
+/// writes  codes[i]; order[i] = i
 kernel void make_codes(
-    global const float *centers,
-    global const uint *triangles,
-    global const float *bounds,
+    global const float *references,
+    global const float *frame,
     global ulong *codes,
+    global uint *order,
     const uint count)
 {
     const uint i = get_global_id(0);
     if (i >= count)
         return;
-    float half_size = 0.0f;
-    for (uint axis = 0; axis < 3; ++axis)
-        half_size = max(half_size, 0.5f * bounds[3 + axis] - 0.5f * bounds[axis]);
     const uint top = (1u << GRID_BITS) - 1;
     ulong code = 0;
     for (uint axis = 0; axis < 3; ++axis) {
-        const float center = centers[3 * (size_t)triangles[i] + axis];
-        const float from_low = 0.5f * center - 0.5f * bounds[axis];
-        const float part = half_size > 0.0f ? from_low / half_size : 0.0f;
-        const uint cell = min((uint)(part * (float)(1u << GRID_BITS)), top);
+        const float low = references[6 * (size_t)i + axis];
+        const float high = references[6 * (size_t)i + 3 + axis];
+        const float from_low = 0.5f * (in_frame(frame, axis, low) + in_frame(frame, axis, high));
+        const uint cell = min((uint)(max(from_low, 0.0f) * (float)(1u << GRID_BITS)), top);
         code |= spread_bits(cell) << (2 - axis);
     }
     codes[i] = code;
+    order[i] = i;
 }
 
-/// Length of the common prefix of the keys at two places, -1 if j is no place.
+/// Make the leaves and a cluster of each.
 ///
-/// A key is the code followed by the place itself, so that no two are equal: the tree is at most
-/// 63 + 32 levels deep.
-static inline int common_prefix(global const ulong *codes, uint count, uint i, int j)
-{
-    if (j < 0 || j >= (int)count)
-        return -1;
-    const ulong difference = codes[i] ^ codes[j];
-    return difference != 0 ? (int)clz(difference) : 64 + (int)clz(i ^ (uint)j);
-}
-
-/// Find the inner nodes of the binary tree and the first place of each block.
-///
-/// One work item an inner node, at least one.
-///
-/// reads   codes[0, count), sorted
-/// writes  ends, splits, parents [node]; starts_block[place], set where a block starts, and there
-///         block_parents[place], the inner node above the block (NO_NODE if the block is all)
-kernel void find_nodes(
-    global const ulong *codes,
-    global uint *ends,
-    global uint *splits,
-    global uint *parents,
-    global uint *starts_block,
-    global uint *block_parents,
+/// reads   references; order[i]; frame
+/// writes  tree[0, count), clusters[0, count)
+kernel void make_leaves(
+    global const float *references,
+    global const float *frame,
+    global const uint *order,
+    global BinaryNode *tree,
+    global uint *clusters,
     const uint count)
 {
-    const uint node = get_global_id(0);
-    if (node == 0) {
-        parents[0] = NO_NODE;
-        if (count <= BLOCK_TRIANGLES) {
-            starts_block[0] = 1;
-            block_parents[0] = NO_NODE;
-        }
-    }
-    if (node + 1 >= count)
+    const uint i = get_global_id(0);
+    if (i >= count)
         return;
-    const int i = (int)node;
-    const int with_next = common_prefix(codes, count, node, i + 1);
-    const int step = with_next > common_prefix(codes, count, node, i - 1) ? 1 : -1;
-
-    // The node covers all places that share more than it shares with its other neighbour.
-    const int outside = common_prefix(codes, count, node, i - step);
-    uint reach = 2;
-    while (common_prefix(codes, count, node, (int)min(reach, count) * step + i) > outside)
-        reach *= 2;
-    uint length = 0;
-    for (uint part = reach / 2; part > 0; part /= 2) {
-        if (common_prefix(codes, count, node, i + (int)(length + part) * step) > outside)
-            length += part;
-    }
-    const int end = i + (int)length * step;
-    ends[node] = (uint)end;
-
-    // It parts where the common prefix of the whole ends.
-    const int inside = common_prefix(codes, count, node, end);
-    uint shared = 0;
-    for (uint part = reach / 2; part > 0; part /= 2) {
-        if (shared + part < length
-            && common_prefix(codes, count, node, i + (int)(shared + part) * step) > inside)
-            shared += part;
-    }
-    const uint split = step > 0 ? (uint)i + shared : (uint)i - shared - 1;
-    splits[node] = split;
-
-    const uint first = (uint)min(i, end);
-    const uint last = (uint)max(i, end);
-    if (split > first)
-        parents[split] = node;
-    if (split + 1 < last)
-        parents[split + 1] = node;
-    if (length + 1 <= BLOCK_TRIANGLES)
-        return;
-    if (split - first < BLOCK_TRIANGLES) {
-        starts_block[first] = 1;
-        block_parents[first] = node;
-    }
-    if (last - split <= BLOCK_TRIANGLES) {
-        starts_block[split + 1] = 1;
-        block_parents[split + 1] = node;
-    }
-}
-
-/// Copy the triangles of each block side by side.
-///
-/// reads   positions; triangles[0, count), sorted; starts[block], its first place;
-///         alpha_flags[triangle] if has_alpha
-/// writes  blocks[0, block_count)
-kernel void fill_blocks(
-    global const float *positions,
-    global const uint *triangles,
-    global const uint *starts,
-    global const uint *alpha_flags,
-    global TriangleBlock *blocks,
-    const uint has_alpha,
-    const uint block_count,
-    const uint count)
-{
-    const uint index = get_global_id(0);
-    if (index >= block_count)
-        return;
-    const uint first = starts[index];
-    const uint end = index + 1 < block_count ? starts[index + 1] : count;
-    global TriangleBlock *block = &blocks[index];
-    for (uint lane = 0; lane < BLOCK_TRIANGLES; ++lane) {
-        const bool used = first + lane < end;
-        const uint triangle = used ? triangles[first + lane] : 0;
-        for (uint k = 0; k < 9; ++k)
-            block->v[k][lane] = used ? positions[9 * (size_t)triangle + k] : NAN;
-        const uint alpha = has_alpha && alpha_flags[triangle] != 0 ? ALPHA_BIT : 0;
-        block->id[lane] = used ? triangle | alpha : NO_HIT;
-    }
-}
-
-static inline Box block_box(global const TriangleBlock *block)
-{
-    Box box = empty_box();
-    for (uint k = 0; k < 9; ++k)
-        for (uint lane = 0; lane < BLOCK_TRIANGLES; ++lane)
-            grow_box(&box, k % 3, block->v[k][lane]);
-    return box;
-}
-
-/// The places that a subtree covers, and its parts.
-typedef struct {
-    uint first;
-    uint size;
-    uint left;
-    uint right;
-} Subtree;
-
-static inline Subtree find_subtree(
-    global const uint *ends, global const uint *splits, uint subtree)
-{
-    Subtree found;
-    found.first = subtree & ~LEAF_BIT;
-    found.size = 1;
-    found.left = subtree;
-    found.right = subtree;
-    if ((subtree & LEAF_BIT) == 0) {
-        const uint end = ends[subtree];
-        const uint split = splits[subtree];
-        const uint last = max(subtree, end);
-        found.first = min(subtree, end);
-        found.size = last - found.first + 1;
-        found.left = split == found.first ? LEAF_BIT | split : split;
-        found.right = split + 1 == last ? LEAF_BIT | last : split + 1;
-    }
-    return found;
-}
-
-/// Box of a subtree that is a block, or whose box is already in `boxes`.
-static inline Box subtree_box(
-    global const uint *ends,
-    global const uint *splits,
-    global const uint *ranks,
-    global const TriangleBlock *blocks,
-    volatile global const float *boxes,
-    uint subtree)
-{
-    const Subtree found = find_subtree(ends, splits, subtree);
-    if (found.size <= BLOCK_TRIANGLES)
-        return block_box(&blocks[ranks[found.first]]);
-    Box box;
+    global const float *box = references + 6 * (size_t)order[i];
+    global BinaryNode *leaf = &tree[i];
     for (uint axis = 0; axis < 3; ++axis) {
-        box.low[axis] = boxes[6 * (size_t)subtree + axis];
-        box.high[axis] = boxes[6 * (size_t)subtree + 3 + axis];
+        leaf->low[axis] = in_frame(frame, axis, box[axis]);
+        leaf->high[axis] = in_frame(frame, axis, box[3 + axis]);
     }
-    return box;
+    leaf->left = order[i];
+    leaf->right = LEAF_BIT;
+    leaf->size = LEAF_BIT | 1;
+    const float cost = BLOCK_COST * half_area(vload3(0, leaf->high) - vload3(0, leaf->low));
+    for (uint k = 0; k < WIDTH - 1; ++k)
+        leaf->costs[k] = cost;
+    clusters[i] = i;
 }
 
-/// Box the inner nodes above the blocks, each by the second of the two work items that reach it.
+/// Find for each cluster the one near it in the order with which it makes the smallest box.
 ///
-/// Which one that is does not matter: it reads both children.
+/// Looks `radius` places to both sides, but not beyond an aligned run of `span` places.  Of equals
+/// the nearest wins, and of two as near the one on the side of its pair, so that equal boxes pair up.
 ///
-/// reads   blocks; starts[block]; ends, splits, parents, block_parents; ranks[place], the block
-///         that starts there
-/// writes  boxes[6 * node + (0..5)]; visits[node], zero before
-kernel void fit_boxes(
-    global const TriangleBlock *blocks,
-    global const uint *starts,
-    global const uint *ranks,
-    global const uint *ends,
-    global const uint *splits,
-    global const uint *parents,
-    global const uint *block_parents,
-    volatile global uint *visits,
-    volatile global float *boxes,
-    const uint block_count)
+/// reads   tree; clusters[0, cluster_count)
+/// writes  nearest[i], a place
+kernel void find_nearest(
+    global const BinaryNode *tree,
+    global const uint *clusters,
+    global uint *nearest,
+    const uint cluster_count,
+    const uint radius,
+    const uint span)
 {
-    const uint index = get_global_id(0);
-    if (index >= block_count)
+    const uint i = get_global_id(0);
+    if (i >= cluster_count)
         return;
-    uint node = block_parents[starts[index]];
-    while (node != NO_NODE) {
-        // Boxes written before the count went up are seen by whoever finds it raised.
-        mem_fence(CLK_GLOBAL_MEM_FENCE);
-        if (atomic_inc(&visits[node]) == 0)
-            break;
-        mem_fence(CLK_GLOBAL_MEM_FENCE);
-        const Subtree parts = find_subtree(ends, splits, node);
-        const Box left = subtree_box(ends, splits, ranks, blocks, boxes, parts.left);
-        const Box right = subtree_box(ends, splits, ranks, blocks, boxes, parts.right);
-        for (uint axis = 0; axis < 3; ++axis) {
-            boxes[6 * (size_t)node + axis] = min(left.low[axis], right.low[axis]);
-            boxes[6 * (size_t)node + 3 + axis] = max(left.high[axis], right.high[axis]);
+    const uint start = i - i % span;
+    const uint end = span < cluster_count - start ? start + span : cluster_count;
+    const float3 low = vload3(0, tree[clusters[i]].low);
+    const float3 high = vload3(0, tree[clusters[i]].high);
+    float least = INFINITY;
+    uint best = i;
+    for (uint k = 2; k < 2 * radius + 2; ++k) {
+        const uint distance = k / 2;
+        const bool up = (k & 1) == (i & 1);
+        if (up ? distance >= end - i : distance > i - start)
+            continue;
+        const uint j = up ? i + distance : i - distance;
+        global const BinaryNode *other = &tree[clusters[j]];
+        const float area =
+            half_area(max(high, vload3(0, other->high)) - min(low, vload3(0, other->low)));
+        if (area < least) {
+            least = area;
+            best = j;
         }
-        node = parents[node];
+    }
+    nearest[i] = best;
+}
+
+/// Mark the clusters that stay, alone or as the lower of a pair.
+///
+/// reads   nearest[0, cluster_count)
+/// writes  stays[i], 0 or 1
+kernel void mark_staying(
+    global const uint *nearest,
+    global uint *stays,
+    const uint cluster_count)
+{
+    const uint i = get_global_id(0);
+    if (i >= cluster_count)
+        return;
+    const uint other = nearest[i];
+    stays[i] = other < i && nearest[other] == i ? 0 : 1;
+}
+
+/// Find the least cost of a subtree as 1 to 7 children of a wide node.
+static inline void weigh_node(global BinaryNode *tree, uint index)
+{
+    global BinaryNode *node = &tree[index];
+    float left[WIDTH];
+    float right[WIDTH];
+    for (uint k = 1; k < WIDTH; ++k) {
+        left[k] = tree[node->left].costs[k - 1];
+        right[k] = tree[node->right].costs[k - 1];
+    }
+    const float area = half_area(vload3(0, node->high) - vload3(0, node->low));
+    float parts[WIDTH + 1];
+    for (uint k = 2; k <= WIDTH; ++k) {
+        parts[k] = INFINITY;
+        for (uint l = 1; l < k; ++l)
+            parts[k] = min(parts[k], left[l] + right[k - l]);
+    }
+    float cost = parts[WIDTH] + NODE_COST * area;
+    if (node->size <= BLOCK_TRIANGLES && BLOCK_COST * area <= cost) {
+        cost = BLOCK_COST * area;
+        node->size |= LEAF_BIT;
+    }
+    for (uint k = 1; k < WIDTH; ++k) {
+        if (k > 1)
+            cost = min(cost, parts[k]);
+        node->costs[k - 1] = cost;
     }
 }
 
-/// Choose the children of a wide node: open the largest inner subtree until there are eight.
+/// Join the pairs, and close up.
 ///
-/// Opens `subtree` itself first, unless it is a block (or nothing): then that is the only child.
-/// Returns the number of children; writes them and their first places and sizes.
-static inline uint open_subtree(
-    global const uint *ends,
-    global const uint *splits,
-    global const float *boxes,
-    uint subtree,
-    uint count,
-    Subtree *children,
-    uint *names)
+/// reads   clusters, nearest [0, cluster_count); places[i], how many before i stay
+/// writes  next_clusters; tree[node_start ...], a node a pair
+kernel void join_pairs(
+    global BinaryNode *tree,
+    global const uint *clusters,
+    global const uint *nearest,
+    global const uint *places,
+    global uint *next_clusters,
+    const uint cluster_count,
+    const uint node_start)
 {
-    if (count == 0)
-        return 0;
-    // Sizes relative to the whole keep the areas in the range of float.
-    float whole = 0.0f;
-    for (uint axis = 0; axis < 3 && count > BLOCK_TRIANGLES; ++axis)
-        whole = max(whole, 0.5f * boxes[3 + axis] - 0.5f * boxes[axis]);
-    const float scale = whole > 0.0f ? 0.5f / whole : 0.0f;
-
-    float areas[NODE_CHILDREN];
-    names[0] = subtree;
-    children[0] = find_subtree(ends, splits, subtree);
-    areas[0] = 0.0f;
-    uint filled = 1;
-    while (filled < NODE_CHILDREN) {
-        uint widest = NODE_CHILDREN;
-        for (uint k = 0; k < filled; ++k) {
-            if (children[k].size > BLOCK_TRIANGLES
-                && (widest == NODE_CHILDREN || areas[k] > areas[widest]))
-                widest = k;
+    const uint i = get_global_id(0);
+    if (i >= cluster_count)
+        return;
+    const uint j = nearest[i];
+    const bool paired = nearest[j] == i && j != i;
+    if (paired && j < i)
+        return;
+    uint cluster = clusters[i];
+    if (paired) {
+        // The upper ones go: as many as do not stay.
+        const uint index = node_start + (j - places[j]);
+        global BinaryNode *node = &tree[index];
+        global const BinaryNode *left = &tree[cluster];
+        global const BinaryNode *right = &tree[clusters[j]];
+        for (uint axis = 0; axis < 3; ++axis) {
+            node->low[axis] = min(left->low[axis], right->low[axis]);
+            node->high[axis] = max(left->high[axis], right->high[axis]);
         }
-        if (widest == NODE_CHILDREN)
-            break;
-        const Subtree opened = children[widest];
-        for (uint part = 0; part < 2; ++part) {
-            const uint k = part == 0 ? widest : filled;
-            names[k] = part == 0 ? opened.left : opened.right;
-            children[k] = find_subtree(ends, splits, names[k]);
-            areas[k] = 0.0f;
-            if (children[k].size > BLOCK_TRIANGLES) {
-                global const float *box = boxes + 6 * (size_t)names[k];
-                const float x = box[3] * scale - box[0] * scale;
-                const float y = box[4] * scale - box[1] * scale;
-                const float z = box[5] * scale - box[2] * scale;
-                areas[k] = x * y + y * z + z * x;
+        node->left = cluster;
+        node->right = clusters[j];
+        node->size = (left->size & ~LEAF_BIT) + (right->size & ~LEAF_BIT);
+        weigh_node(tree, index);
+        cluster = index;
+    }
+    next_clusters[places[i]] = cluster;
+}
+
+/// Choose the children of each wide node of a level, inner ones first.
+///
+/// reads   wide[level_start + i], its binary node; tree
+/// writes  children[8 * (level_start + i) + k], binary nodes, NO_NODE for none; inner_counts and
+///         block_counts [level_start + i]; offsets[i], to be scanned
+kernel void open_nodes(
+    global const BinaryNode *tree,
+    global const uint *wide,
+    global uint *children,
+    global uint *inner_counts,
+    global uint *block_counts,
+    global uint *offsets,
+    const uint level_start,
+    const uint level_count)
+{
+    const uint i = get_global_id(0);
+    if (i >= level_count)
+        return;
+    const uint index = level_start + i;
+    // What waits to be split further: a binary node and how many children it may become.
+    uint names[WIDTH];
+    uint shares[WIDTH];
+    uint chosen[WIDTH];
+    names[0] = wide[index];
+    shares[0] = WIDTH;
+    uint waiting = 1;
+    uint inner = 0;
+    uint blocks = 0;
+    while (waiting > 0) {
+        --waiting;
+        const uint name = names[waiting];
+        uint share = shares[waiting];
+        const BinaryNode node = tree[name];
+        const bool block = (node.size & LEAF_BIT) != 0;
+        while (share > 1 && share < WIDTH && node.costs[share - 1] == node.costs[share - 2])
+            --share;
+        if (node.right == LEAF_BIT || share == 1 || (share == WIDTH && block)) {
+            // Blocks fill the end.
+            if (block)
+                chosen[WIDTH - ++blocks] = name;
+            else
+                chosen[inner++] = name;
+            continue;
+        }
+        float least = INFINITY;
+        uint for_left = 1;
+        for (uint k = 1; k < share; ++k) {
+            const float cost =
+                tree[node.left].costs[k - 1] + tree[node.right].costs[share - k - 1];
+            if (cost < least) {
+                least = cost;
+                for_left = k;
             }
         }
-        ++filled;
+        names[waiting] = node.left;
+        shares[waiting++] = for_left;
+        names[waiting] = node.right;
+        shares[waiting++] = share - for_left;
     }
-    return filled;
+    for (uint k = 0; k < WIDTH; ++k) {
+        uint child = NO_NODE;
+        if (k < inner)
+            child = chosen[k];
+        else if (k - inner < blocks)
+            child = chosen[WIDTH - 1 - (k - inner)];
+        children[WIDTH * (size_t)index + k] = child;
+    }
+    inner_counts[index] = inner;
+    block_counts[index] = blocks;
+    offsets[i] = inner;
 }
 
-/// Count the inner children of each wide node of a level.
+/// Make the inner children of each wide node of a level the next level.
 ///
-/// reads   wide[level_start + i], the subtree of each wide node; ends, splits, boxes
-/// writes  inner_counts[i]
-kernel void count_children(
-    global const uint *ends,
-    global const uint *splits,
-    global const float *boxes,
-    global const uint *wide,
-    global uint *inner_counts,
-    const uint level_start,
-    const uint level_count,
-    const uint count)
-{
-    const uint i = get_global_id(0);
-    if (i >= level_count)
-        return;
-    Subtree children[NODE_CHILDREN];
-    uint names[NODE_CHILDREN];
-    const uint filled =
-        open_subtree(ends, splits, boxes, wide[level_start + i], count, children, names);
-    uint inner = 0;
-    for (uint k = 0; k < filled; ++k)
-        inner += children[k].size > BLOCK_TRIANGLES ? 1 : 0;
-    inner_counts[i] = inner;
-}
-
-/// Give the inner children of each wide node of a level their places in the next level.
-///
-/// reads   as count_children; offsets[i], the exclusive scan of inner_counts
-/// writes  wide[level_start + level_count ...], first_children[level_start + i]
-kernel void place_children(
-    global const uint *ends,
-    global const uint *splits,
-    global const float *boxes,
-    global uint *wide,
-    global uint *first_children,
+/// reads   children, inner_counts; offsets[i], how many inner children the level has before
+/// writes  wide[level_start + level_count ...]; firsts[level_start + i], the first of its own
+kernel void list_children(
+    global const uint *children,
+    global const uint *inner_counts,
     global const uint *offsets,
+    global uint *wide,
+    global uint *firsts,
     const uint level_start,
-    const uint level_count,
-    const uint count)
+    const uint level_count)
 {
     const uint i = get_global_id(0);
     if (i >= level_count)
         return;
-    Subtree children[NODE_CHILDREN];
-    uint names[NODE_CHILDREN];
-    const uint filled =
-        open_subtree(ends, splits, boxes, wide[level_start + i], count, children, names);
-    uint next = level_start + level_count + offsets[i];
-    first_children[level_start + i] = next;
-    for (uint k = 0; k < filled; ++k) {
-        if (children[k].size > BLOCK_TRIANGLES)
-            wide[next++] = names[k];
+    const uint index = level_start + i;
+    const uint first = level_start + level_count + offsets[i];
+    firsts[index] = first;
+    for (uint k = 0; k < inner_counts[index]; ++k)
+        wide[first + k] = children[WIDTH * (size_t)index + k];
+}
+
+/// Count what lies below each wide node of a level, which the level below has done already.
+///
+/// reads   firsts, inner_counts, block_counts
+/// writes  nodes_below, blocks_below
+kernel void count_below(
+    global const uint *firsts,
+    global const uint *inner_counts,
+    global const uint *block_counts,
+    global uint *nodes_below,
+    global uint *blocks_below,
+    const uint level_start,
+    const uint level_count)
+{
+    if (get_global_id(0) >= level_count)
+        return;
+    const uint index = level_start + get_global_id(0);
+    uint nodes = inner_counts[index];
+    uint blocks = block_counts[index];
+    for (uint k = 0; k < inner_counts[index]; ++k) {
+        nodes += nodes_below[firsts[index] + k];
+        blocks += blocks_below[firsts[index] + k];
+    }
+    nodes_below[index] = nodes;
+    blocks_below[index] = blocks;
+}
+
+/// Lay the tree out depth first: the children of a node side by side, then what is below each.
+///
+/// reads   firsts, inner_counts, block_counts, nodes_below, blocks_below; node_starts and
+///         block_starts of the level, where its nodes' children begin
+/// writes  places, node_starts, block_starts of the level below
+kernel void place_children(
+    global const uint *firsts,
+    global const uint *inner_counts,
+    global const uint *block_counts,
+    global const uint *nodes_below,
+    global const uint *blocks_below,
+    global uint *places,
+    global uint *node_starts,
+    global uint *block_starts,
+    const uint level_start,
+    const uint level_count)
+{
+    if (get_global_id(0) >= level_count)
+        return;
+    const uint index = level_start + get_global_id(0);
+    // The root, which is no child, comes first.
+    if (index == 0) {
+        places[0] = 0;
+        node_starts[0] = 1;
+        block_starts[0] = 0;
+    }
+    uint nodes = node_starts[index] + inner_counts[index];
+    uint blocks = block_starts[index] + block_counts[index];
+    for (uint k = 0; k < inner_counts[index]; ++k) {
+        const uint child = firsts[index] + k;
+        places[child] = node_starts[index] + k;
+        node_starts[child] = nodes;
+        block_starts[child] = blocks;
+        nodes += nodes_below[child];
+        blocks += blocks_below[child];
     }
 }
 
-/// Write the wide nodes.
+/// Set the bounds of a child, with the slack that the rounding of its corners needs.
+static inline void set_bounds(global BvhNode *node, uint k, Box box)
+{
+    float reach = 0.0f;
+    // Slack of an empty box would be infinite, and so its bounds no numbers.
+    for (uint axis = 0; axis < 3 && box.low[0] <= box.high[0]; ++axis)
+        reach = max(reach, max(fabs(box.low[axis]), fabs(box.high[axis])));
+    for (uint axis = 0; axis < 3; ++axis) {
+        node->bounds[2 * axis][k] = box.low[axis] - BOX_SLACK * reach;
+        node->bounds[2 * axis + 1][k] = box.high[axis] + BOX_SLACK * reach;
+    }
+}
+
+/// Write the wide nodes and their blocks, but for the bounds of inner children.
 ///
-/// reads   wide, first_children [0, node_count); ranks; blocks; ends, splits, boxes
-/// writes  nodes[0, node_count)
+/// reads   positions, references, triangles; tree; children, inner_counts, block_counts, places,
+///         node_starts, block_starts; alpha_flags[triangle] if has_alpha
+/// writes  nodes[0, node_count), blocks
 kernel void fill_nodes(
-    global const uint *ends,
-    global const uint *splits,
-    global const float *boxes,
-    global const uint *wide,
-    global const uint *first_children,
-    global const uint *ranks,
-    global const TriangleBlock *blocks,
+    global const float *positions,
+    global const float *references,
+    global const uint *triangles,
+    global const uint *alpha_flags,
+    global const BinaryNode *tree,
+    global const uint *children,
+    global const uint *inner_counts,
+    global const uint *block_counts,
+    global const uint *places,
+    global const uint *node_starts,
+    global const uint *block_starts,
     global BvhNode *nodes,
-    const uint node_count,
-    const uint count)
+    global TriangleBlock *blocks,
+    const uint has_alpha,
+    const uint node_count)
 {
     const uint index = get_global_id(0);
     if (index >= node_count)
         return;
-    Subtree children[NODE_CHILDREN];
-    uint names[NODE_CHILDREN];
-    const uint filled = open_subtree(ends, splits, boxes, wide[index], count, children, names);
-    global BvhNode *node = &nodes[index];
-    uint next = first_children[index];
-    for (uint k = 0; k < NODE_CHILDREN; ++k) {
-        Box box = empty_box();
-        uint child = 0;
-        float reach = 0.0f;
-        if (k < filled) {
-            box = subtree_box(ends, splits, ranks, blocks, boxes, names[k]);
-            const bool inner = children[k].size > BLOCK_TRIANGLES;
-            child = inner ? next++ : LEAF_BIT | ranks[children[k].first];
-            for (uint axis = 0; axis < 3; ++axis)
-                reach = max(reach, max(fabs(box.low[axis]), fabs(box.high[axis])));
-        }
-        for (uint axis = 0; axis < 3; ++axis) {
-            node->bounds[2 * axis][k] = box.low[axis] - BOX_SLACK * reach;
-            node->bounds[2 * axis + 1][k] = box.high[axis] + BOX_SLACK * reach;
-        }
-        node->child[k] = child;
+    global BvhNode *node = &nodes[places[index]];
+    const uint inner = inner_counts[index];
+    for (uint k = 0; k < WIDTH; ++k) {
+        node->child[k] = k < inner ? node_starts[index] + k : 0;
         node->unused[k] = 0;
+        set_bounds(node, k, empty_box());
+        if (k < inner || k - inner >= block_counts[index])
+            continue;
+        const uint place = block_starts[index] + k - inner;
+        global TriangleBlock *block = &blocks[place];
+        node->child[k] = LEAF_BIT | place;
+        Box box = empty_box();
+        uint waiting[BLOCK_TRIANGLES];
+        waiting[0] = children[WIDTH * (size_t)index + k];
+        uint count = 1;
+        uint lane = 0;
+        while (count > 0) {
+            global const BinaryNode *below = &tree[waiting[--count]];
+            if (below->right != LEAF_BIT) {
+                waiting[count++] = below->right;
+                waiting[count++] = below->left;
+                continue;
+            }
+            const uint triangle = triangles[below->left];
+            for (uint c = 0; c < 9; ++c)
+                block->v[c][lane] = positions[9 * (size_t)triangle + c];
+            for (uint c = 0; c < 6; ++c)
+                grow_box(&box, c % 3, references[6 * (size_t)below->left + c]);
+            const uint alpha = has_alpha && alpha_flags[triangle] != 0 ? ALPHA_BIT : 0;
+            block->id[lane++] = triangle | alpha;
+        }
+        set_bounds(node, k, box);
+        for (; lane < BLOCK_TRIANGLES; ++lane) {
+            for (uint c = 0; c < 9; ++c)
+                block->v[c][lane] = NAN;
+            block->id[lane] = NO_HIT;
+        }
+    }
+}
+
+/// Bound the inner children of each wide node of a level by what they hold.
+///
+/// reads   places; nodes of the level below
+/// writes  nodes[places[level_start + i]].bounds of inner children
+kernel void fit_nodes(
+    global const uint *places,
+    global BvhNode *nodes,
+    const uint level_start,
+    const uint level_count)
+{
+    if (get_global_id(0) >= level_count)
+        return;
+    global BvhNode *node = &nodes[places[level_start + get_global_id(0)]];
+    for (uint k = 0; k < WIDTH; ++k) {
+        const uint child = node->child[k];
+        // The root is nobody's child: 0 is none.
+        if (child == 0 || (child & LEAF_BIT) != 0)
+            continue;
+        for (uint row = 0; row < 6; ++row) {
+            const float8 bounds = vload8(0, nodes[child].bounds[row]);
+            const float4 low4 = min(bounds.lo, bounds.hi);
+            const float2 low2 = min(low4.lo, low4.hi);
+            const float4 high4 = max(bounds.lo, bounds.hi);
+            const float2 high2 = max(high4.lo, high4.hi);
+            node->bounds[row][k] = (row & 1) != 0 ? max(high2.x, high2.y) : min(low2.x, low2.y);
+        }
     }
 }

@@ -1,4 +1,4 @@
-"""The bounding volume hierarchy, built on the device: Morton codes, binary tree, wide nodes."""
+"""The bounding volume hierarchy, built on the device: binary tree by clustering, wide nodes."""
 
 from __future__ import annotations
 
@@ -9,17 +9,43 @@ from typing import Any
 import numpy as np
 
 from psf_cl.device.device import Buffer, Device
-from psf_cl.device.layout import BVH_NODE, TRIANGLE_BLOCK
+from psf_cl.device.layout import BINARY_NODE, BVH_NODE, TRIANGLE_BLOCK
 from psf_cl.device.primitives import Primitives
-from psf_cl.device.program import load_program
+from psf_cl.device.program import Launch, load_program
 
-#: Triangles that a tree takes at most: kernels search over twice their number with int.
+#: Triangles that a tree takes at most: the binary tree has twice as many nodes, LEAF_BIT apart.
 MOST_TRIANGLES = 1 << 29
+
+#: Children of a node.
+WIDTH = 8
+
+MIN_STACK_SIZE = 128
+_STACK_STEP = 32
 
 _CODE_BITS = 63
 _GROUP = 64
-_STACK_STEP = 32
-MIN_STACK_SIZE = 128
+
+# How far clusters look for a neighbour, in places to either side.
+_RADIUS = 16
+
+# Boxes that grow slowly along the curve all prefer the one before, so that a round joins only few.
+# After a round that joined fewer than one of 16 the next one looks no further than runs of 8, each
+# of which has a least pair: rounds are at most 2 log(count) / log(8 / 7).
+_FEW = 16
+_SHORT_SPAN = 8
+_NO_SPAN = 1 << 31
+
+_NODE_NUMBERS = (
+    "wide",
+    "firsts",
+    "inner_counts",
+    "block_counts",
+    "nodes_below",
+    "blocks_below",
+    "places",
+    "node_starts",
+    "block_starts",
+)
 
 
 @dataclass(frozen=True)
@@ -29,10 +55,10 @@ class Bvh:
     Node 0 is the root, also of no triangles.  The same triangles give the same bits.
 
     Attributes:
-        nodes: ``BvhNode``, ``node_count`` items, level by level.
-        blocks: ``TriangleBlock``, ``block_count`` items (one unused item if there are none).
-        depth: levels of nodes, at most 95: each level of the binary tree takes a bit of the code
-            (63) or, where codes are equal, of the place (32).
+        nodes: ``BvhNode``, ``node_count`` items, depth first: the children of a node side by side.
+        blocks: ``TriangleBlock``, ``block_count`` items in the same order (one unused item if there
+            are none).
+        depth: levels of nodes; no more than rounds of clustering, see ``_SHORT_SPAN``.
         dropped: triangles that are not in the tree because a coordinate is not finite.
     """
 
@@ -58,7 +84,7 @@ def build_bvh(
     """Build the tree over ``triangle_count`` triangles and wait for it.
 
     Triangles with a coordinate that is not finite are left out and counted.  The build takes about
-    60 bytes of scratch a triangle, given back at the end.
+    230 bytes of scratch a triangle, given back at the end.
 
     Args:
         positions: float32, nine items a triangle: the corners p0, p1, p2 in world space, m.
@@ -68,18 +94,18 @@ def build_bvh(
         DeviceError: the device has no room.
         ValueError: there are more than ``MOST_TRIANGLES``.
 
-    Source: Karras, "Maximizing Parallelism in the Construction of BVHs, Octrees, and k-d Trees",
-    HPG 2012; wide nodes by opening the child with the largest surface.
+    Sources: Meister, Bittner, "Parallel Locally-Ordered Clustering for Bounding Volume Hierarchy
+    Construction", TVCG 24 (3), 2018; Ylitie, Karras, Laine, "Efficient Incoherent Ray Traversal on
+    GPUs Through Compressed Wide BVHs", HPG 2017, for the wide nodes.
     """
     if triangle_count > MOST_TRIANGLES:
         raise ValueError(f"{triangle_count} triangles; a tree takes at most {MOST_TRIANGLES}")
     build = _Build(device, positions, triangle_count, alpha_flags)
     try:
-        build.sort_triangles()
-        build.find_binary_tree()
-        build.fill_blocks()
-        build.fit_boxes()
-        depth = build.open_levels()
+        build.make_references()
+        build.sort_references()
+        build.join_clusters()
+        build.open_nodes()
         build.fill_nodes()
         device.wait()
         return Bvh(
@@ -87,7 +113,7 @@ def build_bvh(
             blocks=build.keep("blocks"),
             node_count=build.scalars["node_count"],
             block_count=build.scalars["block_count"],
-            depth=depth,
+            depth=max(len(build.levels), 1),
             dropped=triangle_count - build.scalars["count"],
         )
     finally:
@@ -118,6 +144,8 @@ class _Build:
         self.primitives = Primitives(device)
         self.given: dict[str, Buffer] = {"positions": positions}
         self.own: dict[str, Buffer] = {}
+        self.launches: dict[str, Launch] = {}
+        self.levels: list[tuple[int, int]] = []
         self.scalars = {"triangle_count": triangle_count, "has_alpha": int(alpha_flags is not None)}
         if alpha_flags is None:
             self.allocate("alpha_flags", np.uint32, 1)
@@ -139,133 +167,121 @@ class _Build:
         if not names:
             self.primitives.release()
 
-    def run(self, kernel: str, items: int, *names: str) -> None:
-        """Enqueue a kernel over ``items`` work items with the named arguments."""
+    def run(self, kernel: str, items: int) -> None:
+        """Enqueue a kernel over ``items`` work items; its parameters name what it gets."""
         values: dict[str, Any] = self.given | self.own | self.scalars
-        arguments = {name: values[name] for name in names}
-        self.program.bind(kernel, **arguments)(items, group=_GROUP)
+        launch = self.launches.get(kernel)
+        if launch is None:
+            launch = self.launches[kernel] = self.program.bind_planned(kernel, values)
+        else:
+            held = launch.held
+            launch.set(**{name: values[name] for name in held if values[name] is not held[name]})
+        launch(items, group=_GROUP)
 
     def count_set(self, flags: str, indices: str, count: int) -> int:
-        """Write the indices of the set flags, and to ``ranks`` how many lie before each."""
-        total = self.primitives.compact(
-            self.own[flags], self.own["ranks"], self.own[indices], count
-        )
-        return int(self.device.read(total)[0])
+        """Write the indices of the set flags; return how many there are."""
+        scratch = self.allocate("ranks", np.uint32, count)
+        total = self.primitives.compact(self.own[flags], scratch, self.own[indices], count)
+        found = int(self.device.read(total)[0])
+        self.release("ranks")
+        return found
 
-    def sort_triangles(self) -> None:
-        """Leave in ``codes`` and ``triangles`` what is finite, sorted along the Morton curve."""
+    def make_references(self) -> None:
+        """Leave the boxes of what is finite in ``references``, and their ``triangles``."""
         triangle_count = self.scalars["triangle_count"]
-        centers = self.allocate("centers", np.float32, 3 * triangle_count)
-        self.allocate("kept", np.uint32, triangle_count)
-        self.allocate("ranks", np.uint32, triangle_count)
+        self.allocate("pieces", np.uint32, triangle_count)
+        self.run("count_references", triangle_count)
         self.allocate("triangles", np.uint32, triangle_count)
-        self.run(
-            "prepare_triangles", triangle_count, "positions", "centers", "kept", "triangle_count"
-        )
-        count = self.scalars["count"] = self.count_set("kept", "triangles", triangle_count)
-        self.release("kept")
+        count = self.scalars["count"] = self.count_set("pieces", "triangles", triangle_count)
+        self.release("pieces")
+        references = self.allocate("references", np.float32, 6 * count)
+        self.run("box_references", count)
+        bounds = self.device.read(self.primitives.bounds(references, 2 * count)).astype(np.float64)
+        extent = (bounds[3:] - bounds[:3]).max() if count else 1.0
+        limits = np.finfo(np.float32)
+        scale = np.clip(2.0 / max(extent, limits.tiny), limits.tiny, limits.max)
+        frame = np.append(bounds[:3], scale).astype(np.float32)
+        self.own["frame"] = self.device.upload("frame", frame)
 
-        self.given["bounds"] = self.primitives.bounds(centers, triangle_count)
-        self.allocate("codes", np.uint64, count)
-        self.run("make_codes", count, "centers", "triangles", "bounds", "codes", "count")
-        self.release("centers")
-        self.allocate("spare_codes", np.uint64, count)
-        self.allocate("spare_triangles", np.uint32, count)
-        names = ("codes", "triangles", "spare_codes", "spare_triangles")
-        codes, _ = self.primitives.sort(*(self.own[name] for name in names), count, _CODE_BITS)
-        if codes is self.own["spare_codes"]:
-            for name in names[:2]:
-                spare = f"spare_{name}"
-                self.own[name], self.own[spare] = self.own[spare], self.own[name]
-        self.release("spare_codes", "spare_triangles")
-
-    def find_binary_tree(self) -> None:
-        """Leave the inner nodes in ``ends``, ``splits`` and ``parents``, and where blocks start."""
+    def sort_references(self) -> None:
+        """Leave in ``order`` the references along the Morton curve."""
         count = self.scalars["count"]
-        for name in ("ends", "splits", "parents", "starts_block", "block_parents"):
+        for name in ("codes", "spare_codes"):
+            self.allocate(name, np.uint64, count)
+        for name in ("order", "spare_order"):
             self.allocate(name, np.uint32, count)
-        tree = ("codes", "ends", "splits", "parents", "starts_block", "block_parents", "count")
-        if count > 0:
-            self.run("find_nodes", max(count - 1, 1), *tree)
-        self.release("codes")
-        self.allocate("starts", np.uint32, count)
-        self.scalars["block_count"] = self.count_set("starts_block", "starts", count)
-        self.release("starts_block")
+        self.run("make_codes", count)
+        names = ("codes", "order", "spare_codes", "spare_order")
+        _, order = self.primitives.sort(*(self.own[name] for name in names), count, _CODE_BITS)
+        if order is self.own["spare_order"]:
+            self.own["order"], self.own["spare_order"] = order, self.own["order"]
+        self.release("codes", "spare_codes", "spare_order")
 
-    def fill_blocks(self) -> None:
-        block_count = self.scalars["block_count"]
-        self.allocate("blocks", TRIANGLE_BLOCK.dtype, block_count)
-        self.run(
-            "fill_blocks",
-            block_count,
-            "positions",
-            "triangles",
-            "starts",
-            "alpha_flags",
-            "blocks",
-            "has_alpha",
-            "block_count",
-            "count",
-        )
-        self.release("triangles")
-
-    def fit_boxes(self) -> None:
-        self.allocate("visits", np.uint32, self.scalars["count"])
-        self.allocate("boxes", np.float32, 6 * self.scalars["count"])
-        self.run(
-            "fit_boxes",
-            self.scalars["block_count"],
-            "blocks",
-            "starts",
-            "ranks",
-            "ends",
-            "splits",
-            "parents",
-            "block_parents",
-            "visits",
-            "boxes",
-            "block_count",
-        )
-        self.release("visits", "parents", "block_parents", "starts")
-
-    def open_levels(self) -> int:
-        """Find the wide nodes level by level; return how many levels there are."""
-        for name in ("wide", "first_children", "inner_counts"):
-            self.allocate(name, np.uint32, self.scalars["block_count"])
-        # Node 0 of the binary tree, which a tree of one triangle does not have.
-        root = 0x80000000 if self.scalars["count"] == 1 else 0
-        self.device.write(self.own["wide"], np.array([root], np.uint32))
+    def join_clusters(self) -> None:
+        """Leave the binary tree in ``tree``, its root last."""
+        count = self.scalars["count"]
+        self.allocate("tree", BINARY_NODE.dtype, 2 * count)
+        for name in ("clusters", "next_clusters", "nearest", "stays"):
+            self.allocate(name, np.uint32, count)
+        self.run("make_leaves", count)
+        self.release("order", "frame")
         # Scanned in place.
-        self.own["offsets"] = self.own["inner_counts"]
-        depth, level_start, level_count = 0, 0, 1
-        tree = ("ends", "splits", "boxes", "wide", "level_start", "level_count", "count")
+        self.own["places"] = self.own["stays"]
+        node_start, span = count, _NO_SPAN
+        while count > 1:
+            self.scalars |= {
+                "cluster_count": count,
+                "node_start": node_start,
+                "radius": _RADIUS,
+                "span": span,
+            }
+            self.run("find_nearest", count)
+            self.run("mark_staying", count)
+            stays = self.own["stays"]
+            left = int(self.device.read(self.primitives.scan(stays, stays, count))[0])
+            self.run("join_pairs", count)
+            own = self.own
+            own["clusters"], own["next_clusters"] = own["next_clusters"], own["clusters"]
+            node_start += count - left
+            span = _SHORT_SPAN if (count - left) * _FEW < count else _NO_SPAN
+            count = left
+        del self.own["places"]
+        self.release("clusters", "next_clusters", "nearest", "stays")
+
+    def open_nodes(self) -> None:
+        """Find the wide nodes level by level, and where they lie in memory."""
+        count = self.scalars["count"]
+        for name in _NODE_NUMBERS:
+            self.allocate(name, np.uint32, count)
+        self.allocate("children", np.uint32, WIDTH * count)
+        self.allocate("offsets", np.uint32, count)
+        self.device.write(self.own["wide"], np.array([max(2 * count - 2, 0)], np.uint32))
+        level_start, level_count = 0, 1 if count else 0
         while level_count > 0:
-            self.scalars |= {"level_start": level_start, "level_count": level_count}
-            self.run("count_children", level_count, *tree, "inner_counts")
-            counts = self.own["inner_counts"]
-            total = self.primitives.scan(counts, counts, level_count)
-            self.run("place_children", level_count, *tree, "offsets", "first_children")
-            depth += 1
+            self.levels.append((level_start, level_count))
+            self.run_level("open_nodes", -1)
+            offsets = self.own["offsets"]
+            total = self.primitives.scan(offsets, offsets, level_count)
+            self.run_level("list_children", -1)
             level_start += level_count
             level_count = int(self.device.read(total)[0])
-        del self.own["offsets"]
-        self.scalars["node_count"] = level_start
-        return depth
+        for level in reversed(range(len(self.levels))):
+            self.run_level("count_below", level)
+        for level in range(len(self.levels)):
+            self.run_level("place_children", level)
+        self.scalars["node_count"] = max(level_start, 1)
+        self.scalars["block_count"] = int(self.device.read(self.own["blocks_below"], 1)[0])
+        self.release("wide", "firsts", "offsets", "nodes_below", "blocks_below")
 
     def fill_nodes(self) -> None:
         node_count = self.scalars["node_count"]
         self.allocate("nodes", BVH_NODE.dtype, node_count)
-        self.run(
-            "fill_nodes",
-            node_count,
-            "ends",
-            "splits",
-            "boxes",
-            "wide",
-            "first_children",
-            "ranks",
-            "blocks",
-            "nodes",
-            "node_count",
-            "count",
-        )
+        self.allocate("blocks", TRIANGLE_BLOCK.dtype, self.scalars["block_count"])
+        self.run("fill_nodes", node_count)
+        for level in reversed(range(len(self.levels) - 1)):
+            self.run_level("fit_nodes", level)
+
+    def run_level(self, kernel: str, level: int) -> None:
+        start, count = self.levels[level]
+        self.scalars |= {"level_start": start, "level_count": count}
+        self.run(kernel, count)

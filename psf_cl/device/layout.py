@@ -7,6 +7,7 @@ multiple of 16 bytes.  ``tools/make_layout.py`` writes the header; a test asks t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -29,7 +30,7 @@ class Record:
     meaning: str
     fields: tuple[Field, ...]
 
-    @property
+    @cached_property
     def dtype(self) -> np.dtype:
         scalars = {"float": "<f4", "uint": "<u4", "int": "<i4"}
         return np.dtype([(item.name, scalars[item.type], item.shape) for item in self.fields])
@@ -103,6 +104,19 @@ TRIANGLE_BLOCK = Record(
     _fields("""
     float v[9][4] - vertex * 3 + axis; world, m
     uint id[4] - triangle index, ALPHA_BIT set if its alpha must be looked up
+    """),
+)
+
+BINARY_NODE = Record(
+    "BinaryNode",
+    "A node of the binary tree that the wide nodes are made from; one cache line.",
+    _fields("""
+    float low[3] - of its box, in the unit of the scene's size
+    uint left - child; of a leaf its reference
+    float high[3] - of its box
+    uint right - child; of a leaf LEAF_BIT
+    float costs[7] - least cost of the subtree as at most 1 .. 7 children of a wide node
+    uint size - references below; LEAF_BIT set if they are best kept as one block
     """),
 )
 
@@ -229,6 +243,7 @@ RECORDS = (
     PARAMS,
     BVH_NODE,
     TRIANGLE_BLOCK,
+    BINARY_NODE,
     SURFACE,
     NORMALS,
     UVS,
