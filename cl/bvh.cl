@@ -20,6 +20,7 @@
 #define BLOCK_TRIANGLES 4
 #define WIDTH 8
 #define NO_NODE 0xFFFFFFFFu
+#define RADIUS 16 // how far clusters look for a neighbour, in places; a multiple of 8
 #define GRID_BITS 21 // of the Morton grid, an axis; 3 * 21 = 63 key bits
 
 // What a ray pays for the boxes of a node and the triangles of a block.
@@ -144,13 +145,15 @@ kernel void make_codes(
 /// Make the leaves and a cluster of each.
 ///
 /// reads   references; order[i]; frame
-/// writes  tree[0, count), clusters[0, count)
+/// writes  tree, clusters, boxes as in find_nearest [0, count)
 kernel void make_leaves(
     global const float *references,
     global const float *frame,
     global const uint *order,
     global BinaryNode *tree,
     global uint *clusters,
+    global float *boxes,
+    const uint stride,
     const uint count)
 {
     const uint i = get_global_id(0);
@@ -161,6 +164,8 @@ kernel void make_leaves(
     for (uint axis = 0; axis < 3; ++axis) {
         leaf->low[axis] = in_frame(frame, axis, box[axis]);
         leaf->high[axis] = in_frame(frame, axis, box[3 + axis]);
+        boxes[axis * (size_t)stride + RADIUS + i] = leaf->low[axis];
+        boxes[(3 + axis) * (size_t)stride + RADIUS + i] = leaf->high[axis];
     }
     leaf->left = order[i];
     leaf->right = LEAF_BIT;
@@ -171,45 +176,72 @@ kernel void make_leaves(
     clusters[i] = i;
 }
 
+/// Load a coordinate of eight neighbouring boxes.
+static inline float8 load_row(global const float *boxes, uint row, size_t stride, size_t place)
+{
+    return vload8(0, boxes + row * stride + place);
+}
+
 /// Find for each cluster the one near it in the order with which it makes the smallest box.
 ///
-/// Looks `radius` places to both sides, but not beyond an aligned run of `span` places.  Of equals
-/// the nearest wins, and of two as near the one on the side of its pair, so that equal boxes pair up.
+/// Looks RADIUS places to both sides, but not beyond an aligned run of `span` places.  Of equals the
+/// nearest wins, and of two as near the one on the side of its pair, so that equal boxes pair up.
 ///
-/// reads   tree; clusters[0, cluster_count)
+/// reads   boxes[row * stride + RADIUS + i]: low x, y, z, high x, y, z of the clusters; what lies
+///         RADIUS before and after them need only be readable
 /// writes  nearest[i], a place
 kernel void find_nearest(
-    global const BinaryNode *tree,
-    global const uint *clusters,
+    global const float *boxes,
     global uint *nearest,
+    const uint stride,
     const uint cluster_count,
-    const uint radius,
     const uint span)
 {
     const uint i = get_global_id(0);
     if (i >= cluster_count)
         return;
-    const uint start = i - i % span;
-    const uint end = span < cluster_count - start ? start + span : cluster_count;
-    const float3 low = vload3(0, tree[clusters[i]].low);
-    const float3 high = vload3(0, tree[clusters[i]].high);
-    float least = INFINITY;
-    uint best = i;
-    for (uint k = 2; k < 2 * radius + 2; ++k) {
-        const uint distance = k / 2;
-        const bool up = (k & 1) == (i & 1);
-        if (up ? distance >= end - i : distance > i - start)
-            continue;
-        const uint j = up ? i + distance : i - distance;
-        global const BinaryNode *other = &tree[clusters[j]];
-        const float area =
-            half_area(max(high, vload3(0, other->high)) - min(low, vload3(0, other->low)));
-        if (area < least) {
-            least = area;
-            best = j;
+    const int start = (int)(i - i % span);
+    const int end = (int)min(span, cluster_count - (uint)start) + start;
+    float own[6];
+    for (uint row = 0; row < 6; ++row)
+        own[row] = boxes[row * (size_t)stride + RADIUS + i];
+    float8 least = (float8)(INFINITY);
+    // Twice the distance, and 1 more on the side away from its pair.
+    int8 rank = (int8)(INT_MAX);
+    for (int group = 0; group < 2 * RADIUS / 8; ++group) {
+        // Groups end before i and begin after it.
+        const int offset = group < RADIUS / 8 ? -8 * (group + 1) : 8 * (group - RADIUS / 8) + 1;
+        const size_t place = (size_t)((int)i + offset + RADIUS);
+        const float8 x = max(own[3], load_row(boxes, 3, stride, place))
+                         - min(own[0], load_row(boxes, 0, stride, place));
+        const float8 y = max(own[4], load_row(boxes, 4, stride, place))
+                         - min(own[1], load_row(boxes, 1, stride, place));
+        const float8 z = max(own[5], load_row(boxes, 5, stride, place))
+                         - min(own[2], load_row(boxes, 2, stride, place));
+        const float8 area = x * y + y * z + z * x;
+        const int8 distance = offset + (int8)(0, 1, 2, 3, 4, 5, 6, 7);
+        const int8 j = (int)i + distance;
+        const int side = offset > 0 ? 1 : -1;
+        const int8 found = 2 * side * distance + (((i & 1) == 0) == (side > 0) ? 0 : 1);
+        const int8 better = (j >= start) & (j < end)
+                            & ((area < least) | ((area == least) & (found < rank)));
+        least = better ? area : least;
+        rank = better ? found : rank;
+    }
+    float lane_least[8];
+    int lane_rank[8];
+    vstore8(least, 0, lane_least);
+    vstore8(rank, 0, lane_rank);
+    float best = INFINITY;
+    int best_rank = INT_MAX;
+    for (uint k = 0; k < 8; ++k) {
+        if (lane_least[k] < best || (lane_least[k] == best && lane_rank[k] < best_rank)) {
+            best = lane_least[k];
+            best_rank = lane_rank[k];
         }
     }
-    nearest[i] = best;
+    const bool up = ((i & 1) == 0) == ((best_rank & 1) == 0);
+    nearest[i] = best == INFINITY ? i : up ? i + best_rank / 2 : i - best_rank / 2;
 }
 
 /// Mark the clusters that stay, alone or as the lower of a pair.
@@ -259,14 +291,17 @@ static inline void weigh_node(global BinaryNode *tree, uint index)
 
 /// Join the pairs, and close up.
 ///
-/// reads   clusters, nearest [0, cluster_count); places[i], how many before i stay
-/// writes  next_clusters; tree[node_start ...], a node a pair
+/// reads   clusters, boxes, nearest [0, cluster_count); places[i], how many before i stay
+/// writes  next_clusters, next_boxes; tree[node_start ...], a node a pair
 kernel void join_pairs(
     global BinaryNode *tree,
     global const uint *clusters,
     global const uint *nearest,
     global const uint *places,
     global uint *next_clusters,
+    global const float *boxes,
+    global float *next_boxes,
+    const uint stride,
     const uint cluster_count,
     const uint node_start)
 {
@@ -278,19 +313,26 @@ kernel void join_pairs(
     if (paired && j < i)
         return;
     uint cluster = clusters[i];
+    float box[6];
+    for (uint row = 0; row < 6; ++row) {
+        box[row] = boxes[row * (size_t)stride + RADIUS + i];
+        if (paired) {
+            const float x = boxes[row * (size_t)stride + RADIUS + j];
+            box[row] = row < 3 ? min(box[row], x) : max(box[row], x);
+        }
+        next_boxes[row * (size_t)stride + RADIUS + places[i]] = box[row];
+    }
     if (paired) {
         // The upper ones go: as many as do not stay.
         const uint index = node_start + (j - places[j]);
         global BinaryNode *node = &tree[index];
-        global const BinaryNode *left = &tree[cluster];
-        global const BinaryNode *right = &tree[clusters[j]];
-        for (uint axis = 0; axis < 3; ++axis) {
-            node->low[axis] = min(left->low[axis], right->low[axis]);
-            node->high[axis] = max(left->high[axis], right->high[axis]);
-        }
         node->left = cluster;
         node->right = clusters[j];
-        node->size = (left->size & ~LEAF_BIT) + (right->size & ~LEAF_BIT);
+        node->size = (tree[node->left].size & ~LEAF_BIT) + (tree[node->right].size & ~LEAF_BIT);
+        for (uint axis = 0; axis < 3; ++axis) {
+            node->low[axis] = box[axis];
+            node->high[axis] = box[3 + axis];
+        }
         weigh_node(tree, index);
         cluster = index;
     }

@@ -25,8 +25,8 @@ _STACK_STEP = 32
 _CODE_BITS = 63
 _GROUP = 64
 
-# How far clusters look for a neighbour, in places to either side.
-_RADIUS = 16
+# Room around the clusters' boxes for what looks beyond them: RADIUS in the kernels, and a vector.
+_MARGIN = 64
 
 # Boxes that grow slowly along the curve all prefer the one before, so that a round joins only few.
 # After a round that joined fewer than one of 16 the next one looks no further than runs of 8, each
@@ -223,6 +223,9 @@ class _Build:
         self.allocate("tree", BINARY_NODE.dtype, 2 * count)
         for name in ("clusters", "next_clusters", "nearest", "stays"):
             self.allocate(name, np.uint32, count)
+        stride = self.scalars["stride"] = count + _MARGIN
+        for name in ("boxes", "next_boxes"):
+            self.allocate(name, np.float32, 6 * stride)
         self.run("make_leaves", count)
         self.release("order", "frame")
         # Scanned in place.
@@ -232,7 +235,6 @@ class _Build:
             self.scalars |= {
                 "cluster_count": count,
                 "node_start": node_start,
-                "radius": _RADIUS,
                 "span": span,
             }
             self.run("find_nearest", count)
@@ -241,12 +243,13 @@ class _Build:
             left = int(self.device.read(self.primitives.scan(stays, stays, count))[0])
             self.run("join_pairs", count)
             own = self.own
-            own["clusters"], own["next_clusters"] = own["next_clusters"], own["clusters"]
+            for name in ("clusters", "boxes"):
+                own[name], own[f"next_{name}"] = own[f"next_{name}"], own[name]
             node_start += count - left
             span = _SHORT_SPAN if (count - left) * _FEW < count else _NO_SPAN
             count = left
         del self.own["places"]
-        self.release("clusters", "next_clusters", "nearest", "stays")
+        self.release("clusters", "next_clusters", "boxes", "next_boxes", "nearest", "stays")
 
     def open_nodes(self) -> None:
         """Find the wide nodes level by level, and where they lie in memory."""
