@@ -5,8 +5,9 @@ dependency of psf_cl.  Its fast ``llvm_ad_rgb`` variant needs LLVM (Debian: ``li
 ``DRJIT_LIBLLVM_PATH`` set to its library; without that ``scalar_rgb`` is used.
 
 What is compared is light transport, so only what both renderers mean alike is accepted: flat
-triangles, Lambertian materials, one-sided area lights, point and directional lights, a constant
-environment, pinhole and thin lens.  ``--lambertian`` makes other materials Lambertian first.
+triangles, Lambertian materials with textures, one-sided area lights, point and directional lights,
+a constant environment, pinhole and thin lens.  ``--lambertian`` makes other materials Lambertian
+and opaque first.
 
 Both renderers average K independent seeds.  The criterion, for each comparison: the means of all
 channels agree within 1 %, and the luminances of blocks of 16x16 pixels within 3 sigma, with as many
@@ -18,15 +19,14 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
+from mitsuba_scene import differences, flat, lambertian, mitsuba_scene, set_variant
 from rich.console import Console
 from rich.table import Table
 
@@ -34,8 +34,7 @@ import psf_cl
 from psf_cl.cli.common import positive_integer, setting_argument, size_argument
 from psf_cl.errors import DeviceError, InputError
 from psf_cl.measure.errors import LUMINANCE
-from psf_cl.scene import transform
-from psf_cl.scene.model import Material, Scene, Shape
+from psf_cl.scene.model import Scene
 from psf_cl.settings import Settings, resolve
 
 BLOCK = 16
@@ -125,14 +124,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     if args.seeds < MIN_SEEDS:
         parser.error(f"--seeds: expected at least {MIN_SEEDS}: the noise is measured between seeds")
-    fast = "llvm_ad_rgb" if os.environ.get("DRJIT_LIBLLVM_PATH") else "scalar_rgb"
-    mi.set_variant(args.variant or fast)
+    set_variant(args.variant)
     table = Table("scene", "settings", "mean r g b", "+-", "blocks > 3 sigma", "worst", "sigma z")
     table.add_column("resolution", justify="right")
     table.add_column("")
     passed = True
     for path in args.scenes:
-        scene = flat(psf_cl.load_scene(path, size=args.size), args.lambertian)
+        scene = comparable(psf_cl.load_scene(path, size=args.size), args.lambertian)
         theirs: dict[tuple[int, ...], Estimate] = {}
         for run in args.runs or [[]]:
             settings = resolve(scene.render, scene.path, overrides=dict(run))
@@ -146,113 +144,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0 if passed else 1
 
 
-def flat(scene: Scene, lambertian: bool) -> Scene:
-    """Return the scene without shading normals and checked for what Mitsuba means alike.
+def comparable(scene: Scene, plain: bool) -> Scene:
+    """Return the scene without shading normals, if ``plain`` with Lambertian materials too.
 
     Raises:
         InputError: something in it would not be the same in Mitsuba.
     """
-    materials = scene.materials
-    if lambertian:
-        materials = tuple(
-            replace(m, specular=0.0, metallic=0.0, transmission=0.0) for m in materials
-        )
-    for material in materials:
-        _check_material(material, scene.path)
-    if scene.environment.image is not None:
-        raise InputError(f"{scene.path}: expected an environment of constant radiance")
-    for light in scene.lights:
-        if light.kind == "spot" or light.range != math.inf:
-            raise InputError(f"{scene.path}: light {light.name!r}: expected no cone and no range")
-    shapes = tuple(replace(s, mesh=replace(s.mesh, normals=None)) for s in scene.shapes)
-    return replace(scene, materials=materials, shapes=shapes)
-
-
-def _check_material(material: Material, path: str) -> None:
-    wanted = {
-        "specular": 0.0,
-        "metallic": 0.0,
-        "transmission": 0.0,
-        "base_color_texture": -1,
-        "emission_texture": -1,
-        "alpha_mode": "opaque",
-    }
-    for key, value in wanted.items():
-        if getattr(material, key) != value:
-            raise InputError(f"{path}: material {material.name!r}: expected {key} = {value!r}")
-    if material.double_sided and max(material.emission) > 0.0:
-        raise InputError(f"{path}: material {material.name!r}: expected emission on one side")
-
-
-def mitsuba_scene(scene: Scene, max_depth: int) -> Any:
-    """Return the scene in Mitsuba; ``max_depth`` counts bounces, Mitsuba's path segments."""
-    camera = scene.cameras[scene.camera]
-    # Mitsuba's cameras look along +Z and have +X on their left.
-    turned = camera.transform @ np.diag([-1.0, 1.0, -1.0, 1.0])
-    sensor: dict[str, Any] = {
-        "type": "thinlens" if camera.lens_radius > 0.0 else "perspective",
-        "fov": math.degrees(camera.fov_y),
-        "fov_axis": "y",
-        "to_world": mi.ScalarTransform4f(turned),
-        "film": {
-            "type": "hdrfilm",
-            "width": scene.width,
-            "height": scene.height,
-            "rfilter": {"type": "box"},
-            "pixel_format": "rgb",
-            "component_format": "float32",
-        },
-        "sampler": {"type": "independent"},
-    }
-    if camera.lens_radius > 0.0:
-        sensor |= {"aperture_radius": camera.lens_radius, "focus_distance": camera.focus_distance}
-    content: dict[str, Any] = {
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": max_depth + 1},
-        "sensor": sensor,
-    }
-    for index, shape in enumerate(scene.shapes):
-        content[f"shape_{index}"] = _mesh(shape, scene.materials[shape.material])
-    for index, light in enumerate(scene.lights):
-        content[f"light_{index}"] = (
-            {"type": "point", "position": list(light.position), "intensity": _rgb(light.intensity)}
-            if light.kind == "point"
-            else {
-                "type": "directional",
-                "direction": list(light.direction),
-                "irradiance": _rgb(light.intensity),
-            }
-        )
-    if max(scene.environment.radiance) > 0.0:
-        content["sky"] = {"type": "constant", "radiance": _rgb(scene.environment.radiance)}
-    return mi.load_dict(content)
-
-
-def _rgb(values: Sequence[float]) -> dict[str, Any]:
-    return {"type": "rgb", "value": [float(value) for value in values]}
-
-
-def _mesh(shape: Shape, material: Material) -> Any:
-    properties = mi.Properties()
-    reflectance = {"type": "diffuse", "reflectance": _rgb(material.base_color)}
-    properties["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": reflectance})
-    if max(material.emission) > 0.0:
-        properties["emitter"] = mi.load_dict({"type": "area", "radiance": _rgb(material.emission)})
-    positions = transform.transform_points(shape.transform, shape.mesh.positions)
-    triangles = shape.mesh.triangles
-    if np.linalg.det(shape.transform[:3, :3]) < 0.0:
-        triangles = triangles[:, ::-1]
-    mesh = mi.Mesh(shape.name or "mesh", len(positions), len(triangles), props=properties)
-    values = mi.traverse(mesh)
-    values["vertex_positions"] = positions.astype(np.float32).ravel()
-    values["faces"] = triangles.astype(np.uint32).ravel()
-    values.update()
-    return mesh
+    scene = lambertian(scene) if plain else flat(scene)
+    for what in differences(scene):
+        raise InputError(f"{scene.path}: expected a scene without {what}")
+    return scene
 
 
 def render_mitsuba(scene: Scene, settings: Settings, spp: int, seeds: int) -> Estimate:
     """Render with Mitsuba's path tracer, with independent samples."""
-    built = mitsuba_scene(scene, settings.max_depth)
+    built = mitsuba_scene(scene, settings.max_depth, settings.roulette_depth)
     part = min(spp, max(1, MITSUBA_SAMPLES // (scene.width * scene.height)))
     counts = [min(part, spp - first) for first in range(0, spp, part)]
     images = []

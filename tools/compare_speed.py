@@ -1,0 +1,250 @@
+"""Samples per second beside Mitsuba 3: ``python tools/compare_speed.py SCENE...``.
+
+The Python that runs this needs both renderers: ``.venv/bin/pip install mitsuba``.  Mitsuba's fast
+``llvm_ad_rgb`` variant needs LLVM (Debian: ``libllvm19``) and ``DRJIT_LIBLLVM_PATH`` set to its
+library; without that ``scalar_rgb`` is used, which is no fair rival.
+
+Both trace the same scene to the same depth with the same roulette, over a box filter, each with its
+own sampler.  Mitsuba renders as many samples a pixel at a time as it is fastest with.  Times are
+wall clock, after a warm-up, in interleaved rounds; the table has medians and the range of rounds.
+psf_cl's rate holds the filling and the emptying of its pool at either end of a round.  "passes
+apart" ends every pass before the next begins, as a filter between passes needs.
+
+The images of the timed rounds are compared as tools/compare_mitsuba.py does it.  Where materials
+mean different things the notes say so; ``--lambertian`` makes them alike, with the same geometry
+and lights.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from compare_mitsuba import MIN_SEEDS, Agreement, Estimate, agreement
+from mitsuba_scene import differences, lambertian, mitsuba_scene, set_variant
+from rich.console import Console
+from rich.table import Table
+from rounds import interleaved, ratio, spread
+
+import psf_cl
+from psf_cl.cli.common import positive_integer, positive_number, size_argument
+from psf_cl.errors import DeviceError, InputError
+from psf_cl.measure.errors import LUMINANCE
+from psf_cl.scene.model import Scene
+from psf_cl.settings import Settings, resolve
+
+# Mitsuba's own default is the fifth vertex; psf_cl counts the bounces before it.
+SETTINGS = {"max_depth": "16", "roulette_depth": "4"}
+
+# Samples a pixel and call of Mitsuba that are tried, and samples that a call may have at most.
+MITSUBA_SPP = (4, 16, 64)
+MITSUBA_SAMPLES = 1 << 22
+TRIAL_SECONDS = 1.0
+WARM_UP_SECONDS = 0.5
+
+
+class Mitsuba:
+    """A scene in Mitsuba, and the sum of the images that it rendered.
+
+    Attributes:
+        spp: samples a pixel of one call, those of the highest rate.
+    """
+
+    def __init__(self, scene: Scene, settings: Settings) -> None:
+        self.scene = mitsuba_scene(scene, settings.max_depth, settings.roulette_depth)
+        self.pixels = scene.width * scene.height
+        self.calls = 0
+        self.sum = np.zeros((scene.height, scene.width, 3))
+        self.squares = np.zeros((scene.height, scene.width))
+        self.spp = self._fastest()
+
+    def _fastest(self) -> int:
+        rates = {}
+        most = max(MITSUBA_SAMPLES // self.pixels, 1)
+        for spp in sorted({min(spp, most) for spp in MITSUBA_SPP}):
+            self.spp = spp
+            self._call()  # Compiles.
+            rates[spp] = self.rate(TRIAL_SECONDS)
+        return max(rates, key=lambda spp: rates[spp])
+
+    def _call(self) -> np.ndarray:
+        self.calls += 1
+        integrator = self.scene.integrator()
+        return np.array(integrator.render(self.scene, seed=self.calls, spp=self.spp), np.float64)
+
+    def clear(self) -> None:
+        """Forget the images so far."""
+        self.calls = 0
+        self.sum[:] = self.squares[:] = 0.0
+
+    def rate(self, seconds: float) -> float:
+        """Render for at least ``seconds``; return samples per second."""
+        start = time.perf_counter()
+        count, images = 0, []
+        while time.perf_counter() - start < seconds:
+            images.append(self._call())
+            count += 1
+        rate = count * self.spp * self.pixels / (time.perf_counter() - start)
+        for image in images:
+            self.sum += image
+            self.squares += (image @ LUMINANCE) ** 2
+        return rate
+
+    def estimate(self) -> Estimate:
+        """Return the mean image; its noise, told by the calls, is infinite if they are few."""
+        mean = self.sum / self.calls
+        if self.calls < MIN_SEEDS:
+            return Estimate(mean, np.full(self.squares.shape, np.inf))
+        variance = self.squares / self.calls - (mean @ LUMINANCE) ** 2
+        return Estimate(mean, np.maximum(variance, 0.0) / (self.calls - 1))
+
+
+class Ours:
+    """A scene in psf_cl."""
+
+    def __init__(self, scene: Scene, settings: Settings) -> None:
+        self.renderer = psf_cl.Renderer(scene, settings)
+        self.pixels = scene.width * scene.height
+
+    def rate(self, seconds: float) -> float:
+        """Render for at least ``seconds`` and to the end of a pass; return samples per second."""
+        spent = self.renderer.stats()["render_seconds"]
+        return self._timed(lambda: self.renderer.render(seconds=spent + seconds))
+
+    def passes_apart(self, seconds: float) -> float:
+        """The same, but one pass ends before the next begins."""
+        end = time.perf_counter() + seconds
+
+        def steps() -> None:
+            while time.perf_counter() < end:
+                self.renderer.step()
+
+        return self._timed(steps)
+
+    def _timed(self, render: Callable[[], Any]) -> float:
+        passes = self.renderer.stats()["passes"]
+        start = time.perf_counter()
+        render()
+        seconds = time.perf_counter() - start
+        return (self.renderer.stats()["passes"] - passes) * self.pixels / seconds
+
+    def estimate(self) -> Estimate:
+        image = self.renderer.snapshot(("rgb", "variance"))
+        variance = image.aovs["variance"][..., 0].astype(np.float64)
+        return Estimate(image.rgb.astype(np.float64), variance)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Samples per second of each round, and how the images agree."""
+
+    ours: list[float]
+    apart: list[float]
+    theirs: list[float]
+    spp: int
+    means: tuple[float, float]
+    images: Agreement
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scenes", metavar="SCENE", nargs="+")
+    parser.add_argument("--size", metavar="WxH", type=size_argument, default=(256, 256))
+    parser.add_argument("--rounds", type=positive_integer, default=3)
+    parser.add_argument("--seconds", type=positive_number, default=4.0, help="of a round (4)")
+    parser.add_argument("--lambertian", action="store_true", help="make all materials Lambertian")
+    parser.add_argument("--passes-apart", action="store_true", help="measure that too")
+    parser.add_argument("--variant", help="of Mitsuba")
+    args = parser.parse_args(arguments)
+    variant = set_variant(args.variant)
+    table = _table(args.passes_apart, variant)
+    notes = []
+    for path in args.scenes:
+        scene = psf_cl.load_scene(path, size=args.size)
+        if args.lambertian:
+            scene = lambertian(scene)
+        result = compare(scene, args.rounds, args.seconds, args.passes_apart)
+        name = Path(path).stem
+        table.add_row(name, *_row(result))
+        other = differences(scene)
+        if other:
+            notes.append(f"{name} differs from Mitsuba's by: {'; '.join(other)}")
+    console = Console(width=max(150, Console().width))
+    console.print(table)
+    for note in notes:
+        console.print(note)
+    return 0
+
+
+def compare(scene: Scene, rounds: int, seconds: float, apart: bool) -> Comparison:
+    """Measure one scene in both renderers."""
+    settings = resolve(scene.render, scene.path, preset="pt", overrides=SETTINGS)
+    theirs = Mitsuba(scene, settings)
+    theirs.clear()
+    ours = Ours(scene, settings)
+    ours.rate(WARM_UP_SECONDS)
+    subjects = {
+        "ours": lambda: ours.rate(seconds),
+        "theirs": lambda: theirs.rate(seconds),
+    }
+    if apart:
+        ours.passes_apart(WARM_UP_SECONDS)
+        subjects["apart"] = lambda: ours.passes_apart(seconds)
+    rates = interleaved(subjects, rounds)
+    pair = ours.estimate(), theirs.estimate()
+    ours.renderer.close()
+    return Comparison(
+        rates["ours"],
+        rates.get("apart", []),
+        rates["theirs"],
+        theirs.spp,
+        tuple(float((image.mean @ LUMINANCE).mean()) for image in pair),
+        agreement(*pair),
+    )
+
+
+def _table(apart: bool, variant: str) -> Table:
+    table = Table(title="M samples/s: median (least-greatest of the rounds)", title_justify="left")
+    table.add_column("scene")
+    for head in ("psf_cl", f"Mitsuba {variant} (spp a call)", "ratio"):
+        table.add_column(head, justify="right")
+    if apart:
+        table.add_column("passes apart", justify="right")
+        table.add_column("of psf_cl", justify="right")
+    for head in ("means", "difference", "blocks > 3 sigma"):
+        table.add_column(head, justify="right")
+    return table
+
+
+def _row(result: Comparison) -> list[str]:
+    def million(rates: list[float]) -> str:
+        return spread([rate / 1e6 for rate in rates]).text()
+
+    apart = [million(result.apart), ratio(result.apart, result.ours).text()] if result.apart else []
+    ours, theirs = result.means
+    images = result.images
+    return [
+        million(result.ours),
+        f"{million(result.theirs)} ({result.spp})",
+        ratio(result.ours, result.theirs).text(),
+        *apart,
+        f"{ours:.5f} {theirs:.5f}",
+        f"{100.0 * (ours / theirs - 1.0):+.3f} +- {100.0 * images.ratio_sigma:.3f} %",
+        f"{images.outside} of {images.z.size} (at most {images.allowed})",
+    ]
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except (InputError, DeviceError) as error:
+        sys.exit(f"compare_speed: {error}")
