@@ -10,7 +10,9 @@ wall clock, after a warm-up, in interleaved rounds; the table has medians and th
 psf_cl's rate holds the filling and the emptying of its pool at either end of a round.  "passes
 apart" ends every pass before the next begins, as a filter between passes needs.
 
-The images of the timed rounds are compared as tools/compare_mitsuba.py does it.  Where materials
+The images of the timed rounds are compared as tools/compare_mitsuba.py does it: "blocks out" are
+those beyond 3 sigma, and how many may be.  "cores" is the least that each renderer had of the
+machine in a round: where it is low, something else was running.  Where materials
 mean different things the notes say so; ``--lambertian`` makes them alike, with the same geometry
 and lights.
 """
@@ -26,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from compare_mitsuba import MIN_SEEDS, Agreement, Estimate, agreement
+from compare_mitsuba import Agreement, Estimate, agreement
 from mitsuba_scene import differences, lambertian, mitsuba_scene, set_variant
 from rich.console import Console
 from rich.table import Table
@@ -48,9 +50,12 @@ MITSUBA_SAMPLES = 1 << 22
 TRIAL_SECONDS = 1.0
 WARM_UP_SECONDS = 0.5
 
+# Calls of Mitsuba between which its noise is measured.
+NOISE_CALLS = 16
+
 
 class Mitsuba:
-    """A scene in Mitsuba, and the sum of the images that it rendered.
+    """A scene in Mitsuba, and the sum of the samples that it rendered.
 
     Attributes:
         spp: samples a pixel of one call, those of the highest rate.
@@ -60,49 +65,37 @@ class Mitsuba:
         self.scene = mitsuba_scene(scene, settings.max_depth, settings.roulette_depth)
         self.pixels = scene.width * scene.height
         self.calls = 0
+        self.count = 0
         self.sum = np.zeros((scene.height, scene.width, 3))
-        self.squares = np.zeros((scene.height, scene.width))
-        self.spp = self._fastest()
-
-    def _fastest(self) -> int:
-        rates = {}
         most = max(MITSUBA_SAMPLES // self.pixels, 1)
+        rates = {}
         for spp in sorted({min(spp, most) for spp in MITSUBA_SPP}):
             self.spp = spp
-            self._call()  # Compiles.
+            self._render(spp)  # Compiles.
             rates[spp] = self.rate(TRIAL_SECONDS)
-        return max(rates, key=lambda spp: rates[spp])
+        self.spp = max(rates, key=lambda spp: rates[spp])
 
-    def _call(self) -> np.ndarray:
+    def _render(self, spp: int) -> np.ndarray:
         self.calls += 1
         integrator = self.scene.integrator()
-        return np.array(integrator.render(self.scene, seed=self.calls, spp=self.spp), np.float64)
-
-    def clear(self) -> None:
-        """Forget the images so far."""
-        self.calls = 0
-        self.sum[:] = self.squares[:] = 0.0
+        image = np.array(integrator.render(self.scene, seed=self.calls, spp=spp), np.float64)
+        self.sum += spp * image
+        self.count += spp
+        return image
 
     def rate(self, seconds: float) -> float:
         """Render for at least ``seconds``; return samples per second."""
         start = time.perf_counter()
-        count, images = 0, []
+        before = self.count
         while time.perf_counter() - start < seconds:
-            images.append(self._call())
-            count += 1
-        rate = count * self.spp * self.pixels / (time.perf_counter() - start)
-        for image in images:
-            self.sum += image
-            self.squares += (image @ LUMINANCE) ** 2
-        return rate
+            self._render(self.spp)
+        return (self.count - before) * self.pixels / (time.perf_counter() - start)
 
     def estimate(self) -> Estimate:
-        """Return the mean image; its noise, told by the calls, is infinite if they are few."""
-        mean = self.sum / self.calls
-        if self.calls < MIN_SEEDS:
-            return Estimate(mean, np.full(self.squares.shape, np.inf))
-        variance = self.squares / self.calls - (mean @ LUMINANCE) ** 2
-        return Estimate(mean, np.maximum(variance, 0.0) / (self.calls - 1))
+        """Return the mean image and its noise, which some more calls tell."""
+        spp = MITSUBA_SPP[0]
+        luminance = np.stack([self._render(spp) @ LUMINANCE for _ in range(NOISE_CALLS)])
+        return Estimate(self.sum / self.count, luminance.var(axis=0, ddof=1) * spp / self.count)
 
 
 class Ours:
@@ -142,7 +135,13 @@ class Ours:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Samples per second of each round, and how the images agree."""
+    """Samples per second of each round, and how the images agree.
+
+    Attributes:
+        spp: of a call of Mitsuba.
+        means: luminance of the images, ours and Mitsuba's.
+        cores: the least that either renderer had in a round.
+    """
 
     ours: list[float]
     apart: list[float]
@@ -150,6 +149,7 @@ class Comparison:
     spp: int
     means: tuple[float, float]
     images: Agreement
+    cores: tuple[float, float]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -178,7 +178,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         other = differences(scene)
         if other:
             notes.append(f"{name} differs from Mitsuba's by: {'; '.join(other)}")
-    console = Console(width=max(150, Console().width))
+    console = Console(width=max(170, Console().width))
     console.print(table)
     for note in notes:
         console.print(note)
@@ -189,7 +189,6 @@ def compare(scene: Scene, rounds: int, seconds: float, apart: bool) -> Compariso
     """Measure one scene in both renderers."""
     settings = resolve(scene.render, scene.path, preset="pt", overrides=SETTINGS)
     theirs = Mitsuba(scene, settings)
-    theirs.clear()
     ours = Ours(scene, settings)
     ours.rate(WARM_UP_SECONDS)
     subjects = {
@@ -199,7 +198,8 @@ def compare(scene: Scene, rounds: int, seconds: float, apart: bool) -> Compariso
     if apart:
         ours.passes_apart(WARM_UP_SECONDS)
         subjects["apart"] = lambda: ours.passes_apart(seconds)
-    rates = interleaved(subjects, rounds)
+    measured = interleaved(subjects, rounds)
+    rates = measured.values
     pair = ours.estimate(), theirs.estimate()
     ours.renderer.close()
     return Comparison(
@@ -209,18 +209,22 @@ def compare(scene: Scene, rounds: int, seconds: float, apart: bool) -> Compariso
         theirs.spp,
         tuple(float((image.mean @ LUMINANCE).mean()) for image in pair),
         agreement(*pair),
+        (measured.cores["ours"], measured.cores["theirs"]),
     )
 
 
 def _table(apart: bool, variant: str) -> Table:
-    table = Table(title="M samples/s: median (least-greatest of the rounds)", title_justify="left")
+    table = Table(
+        title=f"M samples/s beside Mitsuba {variant}: median (least-greatest of the rounds)",
+        title_justify="left",
+    )
     table.add_column("scene")
-    for head in ("psf_cl", f"Mitsuba {variant} (spp a call)", "ratio"):
+    for head in ("psf_cl", "Mitsuba", "spp a call", "ratio"):
         table.add_column(head, justify="right")
     if apart:
         table.add_column("passes apart", justify="right")
-        table.add_column("of psf_cl", justify="right")
-    for head in ("means", "difference", "blocks > 3 sigma"):
+        table.add_column("share", justify="right")
+    for head in ("means", "difference", "blocks out", "cores"):
         table.add_column(head, justify="right")
     return table
 
@@ -234,12 +238,14 @@ def _row(result: Comparison) -> list[str]:
     images = result.images
     return [
         million(result.ours),
-        f"{million(result.theirs)} ({result.spp})",
+        million(result.theirs),
+        str(result.spp),
         ratio(result.ours, result.theirs).text(),
         *apart,
         f"{ours:.5f} {theirs:.5f}",
         f"{100.0 * (ours / theirs - 1.0):+.3f} +- {100.0 * images.ratio_sigma:.3f} %",
-        f"{images.outside} of {images.z.size} (at most {images.allowed})",
+        f"{images.outside} of {images.z.size}, {images.allowed} may",
+        " ".join(f"{cores:.2f}" for cores in result.cores),
     ]
 
 

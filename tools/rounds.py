@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import statistics
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -19,14 +21,32 @@ class Spread:
         return f"{self.median:.{digits}f} ({self.low:.{digits}f}-{self.high:.{digits}f})"
 
 
-def interleaved(subjects: Mapping[str, Callable[[], float]], rounds: int) -> dict[str, list[float]]:
+@dataclass(frozen=True)
+class Rounds:
+    """What ``interleaved`` measured.
+
+    Attributes:
+        values: of each subject, one a round.
+        cores: of each subject, the least processor time that it had in a round, over the wall time:
+            far below the cores of the machine if others took them.
+    """
+
+    values: dict[str, list[float]]
+    cores: dict[str, float]
+
+
+def interleaved(subjects: Mapping[str, Callable[[], float]], rounds: int) -> Rounds:
     """Measure every subject once a round, every second round in reverse order."""
     values: dict[str, list[float]] = {name: [] for name in subjects}
+    cores = dict.fromkeys(subjects, float(os.cpu_count() or 1))
     names = list(subjects)
     for index in range(rounds):
         for name in names if index % 2 == 0 else reversed(names):
+            wall, processor = time.perf_counter(), time.process_time()
             values[name].append(subjects[name]())
-    return values
+            used = (time.process_time() - processor) / (time.perf_counter() - wall)
+            cores[name] = min(cores[name], used)
+    return Rounds(values, cores)
 
 
 def spread(values: Sequence[float]) -> Spread:
