@@ -7,14 +7,13 @@ library; without that ``scalar_rgb`` is used, which is no fair rival.
 Both trace the same scene to the same depth with the same roulette, over a box filter, each with its
 own sampler.  Mitsuba renders as many samples a pixel at a time as it is fastest with.  Times are
 wall clock, after a warm-up, in interleaved rounds; the table has medians and the range of rounds.
-psf_cl's rate holds the filling and the emptying of its pool at either end of a round.  "passes
-apart" ends every pass before the next begins, as a filter between passes needs.
+psf_cl's rate is that of a pool that stays full; "passes apart" ends every pass before the next
+begins, as a filter between passes needs.
 
 The images of the timed rounds are compared as tools/compare_mitsuba.py does it: "blocks out" are
 those beyond 3 sigma, and how many may be.  "cores" is the least that each renderer had of the
-machine in a round: where it is low, something else was running.  Where materials
-mean different things the notes say so; ``--lambertian`` makes them alike, with the same geometry
-and lights.
+machine in a round: where it is low, something else was running.  Where materials mean different
+things the notes say so; ``--lambertian`` makes them alike, with the same geometry and lights.
 """
 
 from __future__ import annotations
@@ -22,17 +21,16 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from compare_mitsuba import Agreement, Estimate, agreement
+from measuring import interleaved, ratio, samples_per_second, spread
 from mitsuba_scene import differences, lambertian, mitsuba_scene, set_variant
 from rich.console import Console
 from rich.table import Table
-from rounds import interleaved, ratio, spread
 
 import psf_cl
 from psf_cl.cli.common import positive_integer, positive_number, size_argument
@@ -106,26 +104,18 @@ class Ours:
         self.pixels = scene.width * scene.height
 
     def rate(self, seconds: float) -> float:
-        """Render for at least ``seconds`` and to the end of a pass; return samples per second."""
-        spent = self.renderer.stats()["render_seconds"]
-        return self._timed(lambda: self.renderer.render(seconds=spent + seconds))
+        """Render for at least ``seconds``; return samples per second."""
+        return samples_per_second(self.renderer, seconds)
 
     def passes_apart(self, seconds: float) -> float:
         """The same, but one pass ends before the next begins."""
-        end = time.perf_counter() + seconds
-
-        def steps() -> None:
-            while time.perf_counter() < end:
-                self.renderer.step()
-
-        return self._timed(steps)
-
-    def _timed(self, render: Callable[[], Any]) -> float:
-        passes = self.renderer.stats()["passes"]
+        self.renderer.step()  # Ends what is in flight.
+        first = self.renderer.scheduler.passes
         start = time.perf_counter()
-        render()
-        seconds = time.perf_counter() - start
-        return (self.renderer.stats()["passes"] - passes) * self.pixels / seconds
+        while time.perf_counter() - start < seconds:
+            self.renderer.step()
+        elapsed = time.perf_counter() - start
+        return (self.renderer.scheduler.passes - first) * self.pixels / elapsed
 
     def estimate(self) -> Estimate:
         image = self.renderer.snapshot(("rgb", "variance"))

@@ -35,10 +35,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from measuring import Rounds, interleaved, ratio, spread
 from mitsuba_scene import set_variant
 from rich.console import Console
 from rich.table import Table
-from rounds import Rounds, interleaved, ratio, spread
 
 import psf_cl
 from psf_cl import tables

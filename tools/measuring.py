@@ -8,6 +8,11 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from psf_cl.renderer import Renderer
+
+# More passes than any measurement comes to.
+ENDLESS = 1 << 30
+
 
 @dataclass(frozen=True)
 class Spread:
@@ -65,3 +70,15 @@ def ratio(above: Sequence[float], below: Sequence[float]) -> Spread:
         ValueError: not as many rounds of both.
     """
     return spread([a / b for a, b in zip(above, below, strict=True)])
+
+
+def samples_per_second(renderer: Renderer, seconds: float) -> float:
+    """Render on for at least ``seconds``; return the samples started per second of wall time.
+
+    Paths in flight stay in the pool, so of a pool that was full these are the samples finished.
+    """
+    before = renderer.stats()["rays"]["camera"]
+    start = time.perf_counter()
+    renderer.render(spp=ENDLESS, progress=lambda progress: time.perf_counter() - start < seconds)
+    elapsed = time.perf_counter() - start
+    return (renderer.stats()["rays"]["camera"] - before) / elapsed
