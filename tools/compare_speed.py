@@ -12,8 +12,11 @@ begins, as a filter between passes needs.
 
 The images of the timed rounds are compared as tools/compare_mitsuba.py does it: "blocks out" are
 those beyond 3 sigma, and how many may be.  "cores" is the least that each renderer had of the
-machine in a round: where it is low, something else was running.  Where materials mean different
-things the notes say so; ``--lambertian`` makes them alike, with the same geometry and lights.
+machine in a round: where it is low, something else was running.
+
+Where materials are more than Lambertian, Mitsuba runs psf_cl's BSDF (tools/mitsuba_bsdf.py), so
+that both do the same work.  ``--own-materials`` takes Mitsuba's own plugins that come closest; the
+images differ then.  ``--lambertian`` makes all materials so in both.
 """
 
 from __future__ import annotations
@@ -59,8 +62,9 @@ class Mitsuba:
         spp: samples a pixel of one call, those of the highest rate.
     """
 
-    def __init__(self, scene: Scene, settings: Settings) -> None:
-        self.scene = mitsuba_scene(scene, settings.max_depth, settings.roulette_depth)
+    def __init__(self, scene: Scene, settings: Settings, own_materials: bool) -> None:
+        depths = settings.max_depth, settings.roulette_depth
+        self.scene = mitsuba_scene(scene, *depths, own_materials)
         self.pixels = scene.width * scene.height
         self.calls = 0
         self.count = 0
@@ -152,6 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--rounds", type=positive_integer, default=3)
     parser.add_argument("--seconds", type=positive_number, default=4.0, help="of a round (4)")
     parser.add_argument("--lambertian", action="store_true", help="make all materials Lambertian")
+    parser.add_argument("--own-materials", action="store_true", help="let Mitsuba use its own")
     parser.add_argument("--passes-apart", action="store_true", help="measure that too")
     parser.add_argument("--variant", help="of Mitsuba")
     args = parser.parse_args(arguments)
@@ -162,10 +167,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         scene = psf_cl.load_scene(path, size=args.size)
         if args.lambertian:
             scene = lambertian(scene)
-        result = compare(scene, args.rounds, args.seconds, args.passes_apart)
+        result = compare(scene, args.rounds, args.seconds, args.passes_apart, args.own_materials)
         name = Path(path).stem
         table.add_row(name, *_row(result))
-        other = differences(scene)
+        other = differences(scene, args.own_materials)
         if other:
             notes.append(f"{name} differs from Mitsuba's by: {'; '.join(other)}")
     console = Console(width=max(170, Console().width))
@@ -175,10 +180,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def compare(scene: Scene, rounds: int, seconds: float, apart: bool) -> Comparison:
+def compare(
+    scene: Scene, rounds: int, seconds: float, apart: bool, own_materials: bool
+) -> Comparison:
     """Measure one scene in both renderers."""
     settings = resolve(scene.render, scene.path, preset="pt", overrides=SETTINGS)
-    theirs = Mitsuba(scene, settings)
+    theirs = Mitsuba(scene, settings, own_materials)
     ours = Ours(scene, settings)
     ours.rate(WARM_UP_SECONDS)
     subjects = {

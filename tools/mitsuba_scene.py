@@ -49,8 +49,8 @@ def flat(scene: Scene) -> Scene:
     return replace(scene, shapes=shapes)
 
 
-def differences(scene: Scene) -> list[str]:
-    """Return what will not look the same in Mitsuba, a few words each."""
+def differences(scene: Scene, own_materials: bool = False) -> list[str]:
+    """Return what will not look the same in ``mitsuba_scene``, a few words each."""
     used = [scene.materials[i] for i in sorted({s.material for s in tables.visible_shapes(scene)})]
     textures = [
         scene.textures[i]
@@ -59,7 +59,7 @@ def differences(scene: Scene) -> list[str]:
         if i >= 0
     ]
     found = {
-        "reflection other than Lambertian": any(not _is_diffuse(m) for m in used),
+        "reflection other than Lambertian": own_materials and any(not _is_diffuse(m) for m in used),
         "alpha masks (Mitsuba's shadow rays do not see through them)": any(map(is_cut_out, used)),
         "emission on both sides": any(emits(m) and m.double_sided for m in used),
         "shading normals": any(s.mesh.normals is not None for s in tables.visible_shapes(scene)),
@@ -71,12 +71,16 @@ def differences(scene: Scene) -> list[str]:
     return [what for what, there in found.items() if there]
 
 
-def mitsuba_scene(scene: Scene, max_depth: int, roulette_depth: int) -> Any:
+def mitsuba_scene(
+    scene: Scene, max_depth: int, roulette_depth: int, own_materials: bool = False
+) -> Any:
     """Return the scene in Mitsuba, its integrator the path tracer.
 
     Args:
         max_depth: bounces; Mitsuba's own counts the path's segments.
         roulette_depth: bounces before roulette, as psf_cl counts: Mitsuba's ``rr_depth`` less 1.
+        own_materials: whether Mitsuba's own plugins are to come close to materials other than
+            Lambertian, instead of psf_cl's BSDF written for Mitsuba.
 
     Raises:
         InputError: the scene has an environment image.
@@ -97,7 +101,9 @@ def mitsuba_scene(scene: Scene, max_depth: int, roulette_depth: int) -> Any:
     for shape in tables.visible_shapes(scene):
         groups[shape.material, shape.mesh.normals is not None].append(shape)
     for index, ((material, _), shapes) in enumerate(groups.items()):
-        content[f"mesh_{index}"] = _mesh(shapes, scene.materials[material], scene.textures)
+        content[f"mesh_{index}"] = _mesh(
+            shapes, scene.materials[material], scene.textures, own_materials
+        )
     for index, light in enumerate(filter(shines, scene.lights)):
         content[f"light_{index}"] = _light(light)
     if max(scene.environment.radiance) > 0.0:
@@ -161,7 +167,26 @@ def _is_diffuse(material: Material) -> bool:
     return material.specular == material.metallic == material.transmission == 0.0
 
 
-def _bsdf(material: Material, textures: tuple[Texture, ...]) -> dict[str, Any]:
+def _bsdf(material: Material, textures: tuple[Texture, ...], own: bool) -> dict[str, Any]:
+    bsdf = _own_bsdf(material, textures) if own or _is_diffuse(material) else None
+    if bsdf is None:
+        import mitsuba_bsdf  # Needs the variant, which is set by now.
+
+        bsdf = {
+            "type": mitsuba_bsdf.NAME,
+            "base_color": _colour(material.base_color, material.base_color_texture, textures),
+            "metallic": material.metallic,
+            "specular": material.specular,
+            "transmission": material.transmission,
+            "ior": material.ior,
+            "roughness": material.roughness,
+        }
+    if is_cut_out(material):
+        bsdf = {"type": "mask", "opacity": _mask(material, textures), "bsdf": bsdf}
+    return bsdf
+
+
+def _own_bsdf(material: Material, textures: tuple[Texture, ...]) -> dict[str, Any]:
     """Return the plugin of Mitsuba that comes closest, and of those the fastest.
 
     Its ``roughplastic`` is not among them: it gives back a third of what a rough white coat should.
@@ -193,8 +218,6 @@ def _bsdf(material: Material, textures: tuple[Texture, ...]) -> dict[str, Any]:
         }
     if material.transmission == 0.0 or material.metallic == 1.0:
         bsdf = {"type": "twosided", "bsdf": bsdf}
-    if is_cut_out(material):
-        bsdf = {"type": "mask", "opacity": _mask(material, textures), "bsdf": bsdf}
     return bsdf
 
 
@@ -241,10 +264,12 @@ def _enlarged(values: np.ndarray, axis: int) -> np.ndarray:
     return first + (second - first) * share
 
 
-def _mesh(shapes: list[Shape], material: Material, textures: tuple[Texture, ...]) -> Any:
+def _mesh(
+    shapes: list[Shape], material: Material, textures: tuple[Texture, ...], own_materials: bool
+) -> Any:
     """Return shapes of one material as one mesh, all with shading normals or all without."""
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(_bsdf(material, textures))
+    properties["bsdf"] = mi.load_dict(_bsdf(material, textures, own_materials))
     if emits(material):
         radiance = _colour(material.emission, material.emission_texture, textures)
         properties["emitter"] = mi.load_dict({"type": "area", "radiance": radiance})
