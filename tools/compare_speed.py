@@ -16,7 +16,8 @@ machine in a round: where it is low, something else was running.
 
 Where materials are more than Lambertian, Mitsuba runs psf_cl's BSDF (tools/mitsuba_bsdf.py), so
 that both do the same work.  ``--own-materials`` takes Mitsuba's own plugins that come closest; the
-images differ then.  ``--lambertian`` makes all materials so in both.
+images differ then.  Shading normals near the horizon and cut-outs before a light mean different
+things: ``--flat`` leaves them away in both, ``--lambertian`` also makes all materials so.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from pathlib import Path
 import numpy as np
 from compare_mitsuba import Agreement, Estimate, agreement
 from measuring import interleaved, ratio, samples_per_second, spread
-from mitsuba_scene import differences, lambertian, mitsuba_scene, set_variant
+from mitsuba_scene import differences, flat, lambertian, mitsuba_scene, opaque, set_variant
 from rich.console import Console
 from rich.table import Table
 
@@ -155,7 +156,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--size", metavar="WxH", type=size_argument, default=(256, 256))
     parser.add_argument("--rounds", type=positive_integer, default=3)
     parser.add_argument("--seconds", type=positive_number, default=4.0, help="of a round (4)")
-    parser.add_argument("--lambertian", action="store_true", help="make all materials Lambertian")
+    parser.add_argument("--flat", action="store_true", help="no shading normals, no cut-outs")
+    parser.add_argument("--lambertian", action="store_true", help="that, and all Lambertian")
     parser.add_argument("--own-materials", action="store_true", help="let Mitsuba use its own")
     parser.add_argument("--passes-apart", action="store_true", help="measure that too")
     parser.add_argument("--variant", help="of Mitsuba")
@@ -167,6 +169,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         scene = psf_cl.load_scene(path, size=args.size)
         if args.lambertian:
             scene = lambertian(scene)
+        elif args.flat:
+            scene = flat(opaque(scene))
         result = compare(scene, args.rounds, args.seconds, args.passes_apart, args.own_materials)
         name = Path(path).stem
         table.add_row(name, *_row(result))

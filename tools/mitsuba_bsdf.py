@@ -51,7 +51,30 @@ class _Bsdf(mi.BSDF):
 
     def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> Any:
         p = self._point(si, active)
+        return self._sample(p, self._chances(p), sample1, sample2, active)
+
+    def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        p = self._point(si, active)
+        return self._eval_pdf(p, self._chances(p), wo, active)
+
+    def eval_pdf_sample(
+        self, ctx: Any, si: Any, wo: Any, sample1: Any, sample2: Any, active: Any = True
+    ) -> Any:
+        p = self._point(si, active)
         chances = self._chances(p)
+        evaluated = self._eval_pdf(p, chances, wo, active)
+        return *evaluated, *self._sample(p, chances, sample1, sample2, active)
+
+    def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        return self.eval_pdf(ctx, si, wo, active)[0]
+
+    def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        return self.eval_pdf(ctx, si, wo, active)[1]
+
+    def to_string(self) -> str:
+        return NAME
+
+    def _sample(self, p: _Point, chances: Any, sample1: Any, sample2: Any, active: Any) -> Any:
         i = self._draw(p, chances, sample1, sample2)
         value, pdf = self._evaluate(p, chances, i)
         drawn = mi.BSDFSample3f()
@@ -63,20 +86,10 @@ class _Bsdf(mi.BSDF):
         good = active & (pdf > 0.0)
         return drawn, dr.select(good, value / dr.select(good, pdf, 1.0), 0.0)
 
-    def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-        p = self._point(si, active)
+    def _eval_pdf(self, p: _Point, chances: Any, wo: Any, active: Any) -> Any:
         i = mi.Vector3f(wo.x, wo.y, wo.z * p.flip)
-        value, pdf = self._evaluate(p, self._chances(p), i)
+        value, pdf = self._evaluate(p, chances, i)
         return dr.select(active, value, 0.0), dr.select(active, pdf, 0.0)
-
-    def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-        return self.eval_pdf(ctx, si, wo, active)[0]
-
-    def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-        return self.eval_pdf(ctx, si, wo, active)[1]
-
-    def to_string(self) -> str:
-        return NAME
 
     # The model.
 

@@ -37,10 +37,14 @@ def set_variant(name: str | None = None) -> str:
 def lambertian(scene: Scene) -> Scene:
     """Return the scene with opaque Lambertian materials and without shading normals."""
     materials = tuple(
-        replace(m, specular=0.0, metallic=0.0, transmission=0.0, alpha_mode="opaque")
-        for m in scene.materials
+        replace(m, specular=0.0, metallic=0.0, transmission=0.0) for m in scene.materials
     )
-    return flat(replace(scene, materials=materials))
+    return flat(opaque(replace(scene, materials=materials)))
+
+
+def opaque(scene: Scene) -> Scene:
+    """Return the scene without cut-outs."""
+    return replace(scene, materials=tuple(replace(m, alpha_mode="opaque") for m in scene.materials))
 
 
 def flat(scene: Scene) -> Scene:

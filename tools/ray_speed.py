@@ -36,7 +36,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from measuring import Rounds, interleaved, ratio, spread
-from mitsuba_scene import set_variant
+from mitsuba_scene import opaque, set_variant
 from rich.console import Console
 from rich.table import Table
 
@@ -308,11 +308,6 @@ def embree_library(folder: Path) -> ctypes.CDLL | None:
         if subprocess.run([*command, *flags], capture_output=True, check=False).returncode == 0:
             return ctypes.CDLL(str(library))
     return None
-
-
-def opaque(scene: Scene) -> Scene:
-    """Return the scene without cut-outs."""
-    return replace(scene, materials=tuple(replace(m, alpha_mode="opaque") for m in scene.materials))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
