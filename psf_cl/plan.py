@@ -11,6 +11,7 @@ import numpy as np
 from psf_cl.device import layout
 from psf_cl.errors import InputError
 from psf_cl.image import AOVS
+from psf_cl.measure.timing import Declared
 from psf_cl.scene.model import Scene, emits, has_environment, is_cut_out, shines
 from psf_cl.settings import Settings
 from psf_cl.stages import camera, connect, film, intersect, shade
@@ -57,6 +58,15 @@ class Plan:
     def total_bytes(self) -> int:
         return sum(buffer.bytes for buffer in self.buffers)
 
+    @property
+    def declared(self) -> dict[str, Declared]:
+        """Return what each kernel declares of its items, by its name."""
+        return {
+            kernel.name: kernel.declared(self.traits.lanes)
+            for stage in self.stages
+            for kernel in stage.kernels
+        }
+
     def defines(self, stage: StageSpec) -> dict[str, int]:
         """Return the macros to build ``stage`` with: what it does not depend on is 0."""
         return {
@@ -76,7 +86,7 @@ class Plan:
                     "name": stage.name,
                     "reason": stage.reason,
                     "sources": list(stage.sources),
-                    "kernels": list(stage.kernels),
+                    "kernels": list(stage.kernel_names),
                     "buffers": [
                         {"name": b.name, "bytes": b.bytes, "what": b.what} for b in stage.buffers
                     ],
@@ -100,6 +110,7 @@ def make_plan(
     traits: DeviceTraits | None = None,
     crop: tuple[int, int, int, int] | None = None,
     statistics: bool = False,
+    full: bool = False,
 ) -> Plan:
     """Derive what a render needs; works without OpenCL.
 
@@ -108,6 +119,8 @@ def make_plan(
         traits: of the device; a CPU if not given.
         crop: (x, y, width, height) in pixels; the whole film if not given.
         statistics: whether the paths of the pool are to be counted by depth.
+        full: turn every feature on, with tables of nothing where the scene has none; the image
+            stays the same, what it costs shows what leaving out gains.
 
     Raises:
         InputError: an unknown AOV, or a crop outside the film.
@@ -137,6 +150,8 @@ def make_plan(
     corners = _few_corners(scene, triangles, traits)
     features = _features(scene, settings, outputs)
     features["FEW"] = _few(triangles, corners, traits)
+    if full:
+        features = _all_on(features)
     pixel_count = width * height
     image = scene.environment.image
     context = Context(
@@ -273,6 +288,23 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
     }
 
 
+def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
+    """Return the features with those that are off turned on.
+
+    What is on keeps its value: as an image of one texel a constant sky would be sampled otherwise.
+    """
+    most = {"ENVIRONMENT": 2}
+    full = {
+        name: feature
+        if feature.value
+        else Feature(most.get(name, 1), f"on for measuring, though {feature.reason}")
+        for name, feature in features.items()
+    }
+    # A list of triangles is what small scenes have in place of something.
+    full["FEW"] = Feature(0, f"a tree for measuring, though {features['FEW'].reason}")
+    return full
+
+
 def _connect(settings: Settings, extended: bool, punctual: bool) -> Feature:
     """Return whether lights are sampled, and why."""
     if not (extended or punctual):
@@ -292,7 +324,7 @@ def _scene_buffers(context: Context, scene: Scene) -> tuple[BufferSpec, ...]:
         if emits(scene.materials[shape.material])
     )
     punctual = sum(shines(light) for light in scene.lights)
-    lights = emitting + punctual + bool(context.features["ENVIRONMENT"].value)
+    lights = emitting + punctual + has_environment(scene.environment)
     float32, uint8 = np.dtype(np.float32), np.dtype(np.uint8)
     buffers = [
         BufferSpec("params", layout.PARAMS.dtype, 1, "camera and settings"),

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ class Renderer:
         outputs: AOVs to deliver besides the image (``psf_cl.plan.AOVS``).
         statistics: whether to measure stages (if ``device`` profiles) and occupancy for ``stats``.
         crop: (x, y, width, height) in pixels, or None for the whole film.
+        full: build with every feature, to measure what leaving them out gains.
 
     Raises:
         InputError: the settings or outputs do not fit the scene.
@@ -48,6 +50,7 @@ class Renderer:
         outputs: Iterable[str] = (),
         crop: tuple[int, int, int, int] | None = None,
         statistics: bool = False,
+        full: bool = False,
     ) -> None:
         self.scene = scene
         self.settings = settings or resolve(scene.render, scene.path)
@@ -55,11 +58,12 @@ class Renderer:
             raise InputError(f"{scene.path}: no camera")
         self.device = device or open_device(profiling=statistics)
         self.plan: Plan = make_plan(
-            scene, self.settings, outputs, self.device.traits, crop, statistics
+            scene, self.settings, outputs, self.device.traits, crop, statistics, full
         )
         self.compile_seconds = 0.0
         self.statistics = statistics
         self.censuses = 0
+        self.programs: dict[str, Program] = {}
         self.depth_counts = np.zeros(film.CENSUS_BINS)
         self.buffers: dict[str, Buffer] = {}
         try:
@@ -89,13 +93,13 @@ class Renderer:
                 self.bvh = self._build_bvh(geometry)
                 self.dropped_triangles = self.bvh.dropped
                 self.build_seconds = time.perf_counter() - start
-            programs = compiling.result()
+            self.programs = compiling.result()
         finally:
             # An error or Ctrl-C is told now, not when the compiler has come to its end.
             background.shutdown(wait=False)
         if self.bvh is not None and self.bvh.stack_size != MIN_STACK_SIZE:
-            programs = self._compile(self.bvh.stack_size)
-        self._bind(programs)
+            self.programs = self._compile(self.bvh.stack_size)
+        self._bind(self.programs)
 
     # What happens each bounce, in its order.
 
@@ -224,11 +228,8 @@ class Renderer:
     def stats(self) -> dict[str, Any]:
         """Return what ``--stats`` writes, without errors against a reference."""
         counters = self.device.read(self.buffers["counters"], layout.COUNTER_INDEX["finished"])
-        rays = {kind: layout.rays_so_far(counters, kind) for kind in ("camera", "bounce", "shadow")}
-        stages = [
-            {"name": name, "launches": launches, "seconds": seconds, "items": items}
-            for name, (launches, seconds, items) in self.device.totals.items()
-        ]
+        rays = {kind: layout.rays_so_far(counters, kind) for kind in layout.RAY_KINDS}
+        stages = [{"name": name} | asdict(spent) for name, spent in self.device.totals.items()]
         return {
             "scene": self.scene.path,
             "spp": self.scheduler.passes,
@@ -302,17 +303,18 @@ class Renderer:
         if self.plan.features["FEW"].value:
             few = tables.few_triangles(geometry.positions, self._cut_out(geometry))
         self.dropped_triangles = few.dropped if few else 0
-        uvs = (
-            geometry.uvs if geometry.uvs is not None else np.zeros(geometry.count, layout.UVS.dtype)
-        )
+
+        def or_zeros(table: np.ndarray | None, record: layout.Record) -> np.ndarray:
+            return np.zeros(geometry.count, record.dtype) if table is None else table
+
         contents = {
             "params": lambda: self._params(geometry, few, len(lights), environment_pmf),
             "corners": lambda: few.corners.reshape(-1),
             "faces": lambda: few.faces.reshape(-1),
             "surfaces": lambda: geometry.surfaces,
             "materials": lambda: tables.material_table(scene.materials),
-            "normals": lambda: geometry.normals,
-            "uvs": lambda: uvs,
+            "normals": lambda: or_zeros(geometry.normals, layout.NORMALS),
+            "uvs": lambda: or_zeros(geometry.uvs, layout.UVS),
             "textures": lambda: textures,
             "texels": lambda: texels.reshape(-1),
             "srgb_to_linear": tables.srgb_to_linear,
@@ -391,7 +393,7 @@ class Renderer:
             if stage.traces:
                 defines |= {"STACK_SIZE": stack_size}
             programs[stage.name] = load_program(self.device, stage.source, defines)
-            programs[stage.name].warm_up(*stage.kernels)
+            programs[stage.name].warm_up(*stage.kernel_names)
         self.compile_seconds += time.perf_counter() - start
         return programs
 
@@ -400,7 +402,7 @@ class Renderer:
             programs[stage.name].bind_planned(kernel, self.buffers)
             for stage in self.plan.stages
             if stage.name != "film"
-            for kernel in stage.kernels
+            for kernel in stage.kernel_names
         ]
         self.film_program = programs["film"]
         self.film_launches = [

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from psf_cl.device.layout import COUNTER_INDEX, rays_so_far
+from psf_cl.device.layout import COUNTER_INDEX, RAY_KINDS, rays_so_far
 
 if TYPE_CHECKING:
     import numpy as np
@@ -76,6 +76,7 @@ class Scheduler:
 
     Attributes:
         passes: whole passes that the film holds.
+        rays: traced until the last look at the counters, by kind.
         clock: seconds spent in ``run``.
     """
 
@@ -83,6 +84,7 @@ class Scheduler:
         self.hooks = hooks
         self.slots = slots
         self.passes = 0
+        self.rays: dict[str, int] = {}
         self.clock = Clock()
         self.bounces = 1
 
@@ -102,8 +104,8 @@ class Scheduler:
         Returns:
             Whether it came to its end, that is, was not stopped.
         """
-        counters = self.hooks.counters()
-        first_samples, last_rays = rays_so_far(counters, "camera"), _all_rays(counters)
+        self._look_at_rays(self.hooks.counters())
+        first_samples, last_rays = self.rays["camera"], sum(self.rays.values())
         first_seconds = self.clock.now()
         limit = spp
         self.hooks.limit(limit if limit is not None else 0xFFFFFFFF)
@@ -117,12 +119,13 @@ class Scheduler:
                         self.hooks.film()
                 counters = self.hooks.counters()
                 self.passes = int(counters[COUNTER_INDEX["film_pass"]])
-                rays = _all_rays(counters)
+                self._look_at_rays(counters)
+                rays = sum(self.rays.values())
                 self._adapt(time.perf_counter() - begin, rays - last_rays)
                 last_rays = rays
                 now = self.clock.now()
                 if progress is not None:
-                    samples = rays_so_far(counters, "camera") - first_samples
+                    samples = self.rays["camera"] - first_samples
                     rate = samples / max(now - first_seconds, 1e-9)
                     if progress(Progress(self.passes, spp, now, seconds, rate)) is False:
                         return False
@@ -134,6 +137,9 @@ class Scheduler:
         finally:
             self.clock.stop()
 
+    def _look_at_rays(self, counters: np.ndarray) -> None:
+        self.rays = {kind: rays_so_far(counters, kind) for kind in RAY_KINDS}
+
     def _adapt(self, seconds: float, rays: int) -> None:
         """Let the next batch take about BATCH_SECONDS, even if the pool is full from now on.
 
@@ -143,7 +149,3 @@ class Scheduler:
         if rays > 0:
             bounce_seconds = seconds / rays * self.slots * RAYS_PER_BOUNCE
             self.bounces = min(max(int(BATCH_SECONDS / bounce_seconds), 1), MAX_BOUNCES)
-
-
-def _all_rays(counters: np.ndarray) -> int:
-    return sum(rays_so_far(counters, kind) for kind in ("camera", "bounce", "shadow"))

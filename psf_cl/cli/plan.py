@@ -46,7 +46,7 @@ def _show_plan(plan: Plan) -> None:
 
     stages = Table("stage", "why", "kernels", title="Stages", title_justify="left")
     for stage in plan.stages:
-        stages.add_row(stage.name, stage.reason, " ".join(stage.kernels))
+        stages.add_row(stage.name, stage.reason, " ".join(stage.kernel_names))
 
     features = Table("macro", "value", "why", title="Compiled for", title_justify="left")
     for name, feature in plan.features.items():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +13,7 @@ import pyopencl as cl
 
 from psf_cl.device.selftest import run_self_test
 from psf_cl.errors import DeviceError, InputError
+from psf_cl.measure.timing import TRANSFER, Interval, Spent
 from psf_cl.settings import DEVICE_VARIABLE
 from psf_cl.traits import DeviceTraits
 
@@ -49,8 +50,9 @@ class Device:
 
     Attributes:
         traits: what the kernels are specialised to.
-        profiling: whether every launch keeps its event until it is collected.
-        totals: launches, seconds and items of each kernel (profiling only).
+        profiling: whether every command keeps its event until it is collected.
+        totals: what was spent on each kernel so far, by its name (profiling only).
+        on_intervals: called with the commands that are done, each time that they are collected.
     """
 
     def __init__(self, context: cl.Context, traits: DeviceTraits, profiling: bool = False) -> None:
@@ -63,8 +65,9 @@ class Device:
         self.allocated_bytes = 0
         self.peak_bytes = 0
         self.programs: dict[tuple[Any, ...], Program] = {}
-        self.events: list[tuple[str, int, cl.Event]] = []
-        self.totals: dict[str, tuple[int, float, int]] = {}
+        self.events: list[tuple[str, str, int, cl.Event]] = []
+        self.totals: dict[str, Spent] = {}
+        self.on_intervals: Callable[[list[Interval]], None] | None = None
 
     @property
     def name(self) -> str:
@@ -96,7 +99,8 @@ class Device:
         with self.failures(f"allocating {size / 2**20:.0f} MiB for {name}"):
             memory = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, size)
             # A pattern of one byte divides every size.
-            cl.enqueue_fill_buffer(self.queue, memory, np.uint8(0), 0, size)
+            event = cl.enqueue_fill_buffer(self.queue, memory, np.uint8(0), 0, size)
+        self.note_event(TRANSFER, f"clear {name}", size, event)
         self.allocated_bytes += size
         self.peak_bytes = max(self.peak_bytes, self.allocated_bytes)
         return Buffer(name, dtype, count, memory)
@@ -118,9 +122,10 @@ class Device:
             )
         if array.size:
             with self.failures(f"writing {buffer.name}"):
-                cl.enqueue_copy(
+                event = cl.enqueue_copy(
                     self.queue, buffer.memory, array, dst_offset=offset * buffer.dtype.itemsize
                 )
+            self.note_event(TRANSFER, f"write {buffer.name}", array.nbytes, event)
 
     def read(self, buffer: Buffer, count: int | None = None, offset: int = 0) -> np.ndarray:
         """Return items of ``buffer`` after all queued work is done."""
@@ -130,15 +135,19 @@ class Device:
         array = np.empty(count, buffer.dtype)
         if count:
             with self.failures(f"reading {buffer.name}"):
-                cl.enqueue_copy(
+                event = cl.enqueue_copy(
                     self.queue, array, buffer.memory, src_offset=offset * buffer.dtype.itemsize
                 )
+            self.note_event(TRANSFER, f"read {buffer.name}", array.nbytes, event)
         return array
 
     def fill(self, buffer: Buffer, byte: int = 0) -> None:
         """Enqueue setting every byte of ``buffer``."""
         with self.failures(f"filling {buffer.name}"):
-            cl.enqueue_fill_buffer(self.queue, buffer.memory, np.uint8(byte), 0, buffer.bytes)
+            event = cl.enqueue_fill_buffer(
+                self.queue, buffer.memory, np.uint8(byte), 0, buffer.bytes
+            )
+        self.note_event(TRANSFER, f"fill {buffer.name}", buffer.bytes, event)
 
     def release(self, *buffers: Buffer) -> None:
         """Give buffers back; using one afterwards is an error."""
@@ -166,13 +175,51 @@ class Device:
         except cl.Error as error:
             raise DeviceError(f"{self.name} failed at {what}: {error}") from error
 
+    def note_event(self, stage: str, name: str, items: int, event: cl.Event) -> None:
+        """Keep the event of a command (profiling only); the arguments are those of ``Interval``."""
+        if self.profiling:
+            # Events of copies hold on to the host's array: a second handle of the event does not.
+            self.events.append((stage, name, items, cl.Event.from_int_ptr(event.int_ptr)))
+
     def collect_events(self) -> None:
-        """Add the events of finished launches to ``totals``; call after everything is done."""
-        for name, items, event in self.events:
-            launches, seconds, done = self.totals.get(name, (0, 0.0, 0))
-            spent = (event.profile.end - event.profile.start) * 1e-9
-            self.totals[name] = (launches + 1, seconds + spent, done + items)
+        """Add the commands so far to ``totals`` and report them; call after everything is done."""
+        info = cl.profiling_info
+        intervals = [
+            Interval(
+                stage,
+                name,
+                items,
+                event.get_profiling_info(info.QUEUED),
+                event.get_profiling_info(info.START),
+                event.get_profiling_info(info.END),
+            )
+            for stage, name, items, event in self.events
+        ]
         self.events.clear()
+        for interval in intervals:
+            if interval.stage != TRANSFER:
+                self.totals.setdefault(interval.name, Spent()).add(interval)
+        if self.on_intervals is not None:
+            self.on_intervals(intervals)
+
+    def copy_bandwidth(self, size: int = 1 << 28, repetitions: int = 5) -> float:
+        """Return the bytes a second, read and written, at which the device copies ``size`` bytes.
+
+        The median of some copies from one buffer to another; for a device that profiles.
+        """
+        size = min(size, self.memory_bytes // 8, self.cl_device.max_mem_alloc_size)
+        source = self.allocate("copied", np.uint8, size)
+        target = self.allocate("copy", np.uint8, size)
+        seconds = []
+        try:
+            with self.failures("measuring copies"):
+                for _ in range(repetitions):
+                    event = cl.enqueue_copy(self.queue, target.memory, source.memory)
+                    event.wait()
+                    seconds.append((event.profile.end - event.profile.start) * 1e-9)
+        finally:
+            self.release(source, target)
+        return 2 * size / float(np.median(seconds))
 
 
 def list_devices() -> list[cl.Device]:

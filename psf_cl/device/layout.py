@@ -380,11 +380,29 @@ def header() -> str:
 
 
 COUNTER_INDEX = {name: index for index, (name, _) in enumerate(COUNTERS)}
+#: What rays are traced for.
+RAY_KINDS = ("camera", "bounce", "shadow")
+
 CONSTANT = {name: value for name, value, _ in CONSTANTS}
 
 
+def path_fields(*names: str) -> tuple[str, ...]:
+    """Return the fields of the path's state that ``names`` tell of: fields, or stems of vectors.
+
+    Raises:
+        ValueError: there is no such field.
+    """
+    found = []
+    for name in names:
+        matching = [known for known, _ in PATH_FIELDS if name in (known, known.rpartition("_")[0])]
+        if not matching:
+            raise ValueError(f"{name}: no such field of a path")
+        found += matching
+    return tuple(found)
+
+
 def rays_so_far(counters: np.ndarray, kind: str) -> int:
-    """Return the rays of ``kind`` (camera, bounce, shadow) that ``counters`` tell of."""
+    """Return the rays of ``kind`` (one of ``RAY_KINDS``) that ``counters`` tell of."""
     at = COUNTER_INDEX[f"{kind}_rays"]
     # Those since the last film launch have not been carried over into the two words yet.
     pending = int(counters[COUNTER_INDEX[f"pending_{kind}"]])

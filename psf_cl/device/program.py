@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -73,6 +74,7 @@ class Program:
     Attributes:
         file: the ``.cl`` file.
         defines: every macro that it was built with.
+        seconds: that building took, down to machine code where it was warmed up.
     """
 
     def __init__(
@@ -86,10 +88,12 @@ class Program:
             *(f"-D{name}={value}" for name, value in sorted(defines.items())),
         ]
         source = assemble(file, folder)
+        start = time.perf_counter()
         try:
             self.program = cl.Program(device.context, source).build(options=options)
         except cl.RuntimeError as error:
             raise DeviceError(f"{file} does not build on {device.name}: {error}") from error
+        self.seconds = time.perf_counter() - start
 
     def warm_up(self, *kernels: str) -> None:
         """Launch ``kernels`` once on zeros, for PoCL generates code at the first launch.
@@ -98,6 +102,7 @@ class Program:
         and waits for it, so that another thread can go on with the device's.
         """
         device = self.device
+        start = time.perf_counter()
         with device.failures(f"warming up {self.file}"):
             queue = cl.CommandQueue(device.context)
             zeros = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, _WARM_UP_BYTES)
@@ -109,6 +114,7 @@ class Program:
                 group = device.traits.group
                 cl.enqueue_nd_range_kernel(queue, kernel, (group,), (group,))
             queue.finish()
+        self.seconds += time.perf_counter() - start
 
     def bind(self, kernel: str, **arguments: Buffer | int | float | np.generic) -> Launch:
         """Return a launch of ``kernel`` with its arguments set by name.
@@ -170,6 +176,7 @@ class Launch:
     ) -> None:
         self.device = program.device
         self.name = name
+        self.stage = Path(program.file).stem
         self.label = f"{program.file}: {name}"
         try:
             # A kernel object holds its arguments, so each binding has its own.
@@ -231,8 +238,7 @@ class Launch:
         padded = -(-items // group) * group
         with self.device.failures(self.label):
             event = cl.enqueue_nd_range_kernel(self.device.queue, self.kernel, (padded,), (group,))
-        if self.device.profiling:
-            self.device.events.append((self.name, items, event))
+        self.device.note_event(self.stage, self.name, items, event)
 
 
 def _type_name(dtype: np.dtype[Any]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from psf_cl.device import layout
-from psf_cl.stages.spec import BufferSpec, Context, StageSpec
+from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
 
 
 def plan(context: Context) -> StageSpec:
@@ -21,13 +21,24 @@ def plan(context: Context) -> StageSpec:
         ),
         BufferSpec("samples", float32, samples, f"radiance of {context.ring} passes in flight"),
     ]
+    direct: tuple[str, ...] = ()
     if context.on("AOV_DIRECT"):
+        direct = ("direct",)
         buffers.append(BufferSpec("direct", float32, samples, "direct light of the same"))
+    started = ("origin", "direction", "beta", "radiance", *direct, "seed", "status")
+    named = ("sample", "pixel")
+    kernel = KernelSpec(
+        "regenerate_paths",
+        reads=(*started, *named),
+        writes=(*started, *named),
+        # An entry of the order of pixels, and a weighted sample a plane.
+        record_bytes=4 + 16 * (1 + len(direct)),
+    )
     return StageSpec(
         "camera",
         "paths start at the camera",
         "camera.cl",
         flags=("LENS", "AOV_DIRECT"),
-        kernels=("regenerate_paths",),
+        kernels=(kernel,),
         buffers=tuple(buffers),
     )

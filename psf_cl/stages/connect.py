@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from psf_cl.stages.spec import Context, StageSpec
+from psf_cl.stages.spec import Context, KernelSpec, StageSpec
 
 
 def plan(context: Context) -> StageSpec | None:
     """Return the stage, or None if no light is sampled."""
     if not context.on("CONNECT"):
         return None
+    direct = ("direct", "status") if context.on("AOV_DIRECT") else ()
+    kernel = KernelSpec(
+        "connect_lights",
+        reads=("light", "shadow", "toward", "radiance", *direct),
+        writes=("light", "radiance", *direct[:1]),
+        rays=("shadow",),
+    )
     return StageSpec(
         "connect",
         "sampled lights need to be seen",
         "connect.cl",
         flags=("FEW", "ALPHA", "AOV_DIRECT"),
-        kernels=("connect_lights",),
+        kernels=(kernel,),
         traces=True,
     )

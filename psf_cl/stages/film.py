@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from psf_cl.device import layout
-from psf_cl.stages.spec import BufferSpec, Context, StageSpec
+from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
 
 #: Ring buffer of samples, the film's buffer that it is added to, and planes in it.
 PLANES = (("samples", "film", 1), ("direct", "film_direct", 1), ("features", "film_features", 3))
@@ -30,9 +30,15 @@ def plan(context: Context) -> StageSpec:
         buffers.append(
             BufferSpec("film_features", dtype, count, "sums of albedo, normal and depth")
         )
-    kernels = ["add_samples", "advance_film"]
+    planes = 1 + context.on("AOV_DIRECT") + 3 * context.on("AOV_FEATURES")
+    # A weighted value; the sums are read and written.
+    sample_bytes = planes * (16 + 2 * dtype.itemsize)
+    kernels = [
+        KernelSpec("add_samples", record_bytes=sample_bytes, per_sample=True, lanes=False),
+        KernelSpec("advance_film", lanes=False),
+    ]
     if context.statistics:
-        kernels.append("count_depths")
+        kernels.append(KernelSpec("count_depths", reads=("status",), record_bytes=8, lanes=False))
         buffers.append(BufferSpec("census", np.dtype(np.uint32), CENSUS_BINS, "paths by depth"))
     return StageSpec(
         "film",

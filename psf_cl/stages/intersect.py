@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from psf_cl.stages.spec import Context, StageSpec
+from psf_cl.stages.spec import Context, KernelSpec, StageSpec
 
 
 def plan(context: Context) -> StageSpec:
     """Return the stage; every render has it."""
+    kernel = KernelSpec(
+        "intersect_closest",
+        reads=("status", "origin", "direction"),
+        writes=("hit",),
+        rays=("camera", "bounce"),
+    )
     return StageSpec(
         "intersect",
         "every ray needs its closest hit",
         "intersect.cl",
-        flags=("FEW", "ALPHA",),
-        kernels=("intersect_closest",),
+        flags=("FEW", "ALPHA"),
+        kernels=(kernel,),
         traces=True,
     )

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from psf_cl.stages.spec import BufferSpec, Context, StageSpec
+from psf_cl.device import layout
+from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
 
 
 def plan(context: Context) -> StageSpec:
@@ -37,6 +38,31 @@ def plan(context: Context) -> StageSpec:
             "AOV_DIRECT",
             "AOV_FEATURES",
         ),
-        kernels=("shade_paths",),
+        kernels=(_kernel(context),),
         buffers=tuple(buffers),
+    )
+
+
+def _kernel(context: Context) -> KernelSpec:
+    """Return the kernel with what it reads and writes under the features that are on."""
+    direct = ("direct",) if context.on("AOV_DIRECT") else ()
+    shadow = ("shadow", "toward", "light") if context.on("CONNECT") else ()
+    walk = ("status", "direction", "beta", "radiance", "pdf", *direct)
+    records = [layout.SURFACE, layout.MATERIAL]
+    if context.on("SMOOTH"):
+        records.append(layout.NORMALS)
+    if context.on("TEXTURES"):
+        records += [layout.UVS, layout.TEXTURE]
+    if context.on("CONNECT"):
+        records.append(layout.LIGHT)
+        if context.on("AREA_LIGHTS"):
+            records += [layout.SURFACE, layout.MATERIAL]
+    if context.features["ENVIRONMENT"].value == 2:
+        records.append(layout.ENVIRONMENT_CELL)
+    feature_bytes = 3 * 16 if context.on("AOV_FEATURES") else 0
+    return KernelSpec(
+        "shade_paths",
+        reads=(*walk, "hit", "sample", "pixel", "seed"),
+        writes=(*walk, "origin", *shadow),
+        record_bytes=sum(record.dtype.itemsize for record in records) + feature_bytes,
     )

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from psf_cl.device.layout import path_fields
+from psf_cl.measure.timing import Declared
 from psf_cl.traits import DeviceTraits
 
 
@@ -25,6 +27,40 @@ class BufferSpec:
 
 
 @dataclass(frozen=True)
+class KernelSpec:
+    """A kernel that is launched, and what it does for an item that needs everything.
+
+    Attributes:
+        reads, writes: fields of the path's state; a vector by its stem (``origin``).
+        record_bytes: read and written outside of it: records of tables, samples, film.
+        per_sample: whether ``record_bytes`` are those of each sample of the render instead.
+        lanes: whether a work item computes as many items as the device has lanes.
+        rays: kinds of rays that it traces (camera, bounce, shadow).
+        hash_accesses: look-ups and insertions.
+    """
+
+    name: str
+    reads: tuple[str, ...] = ()
+    writes: tuple[str, ...] = ()
+    record_bytes: int = 0
+    per_sample: bool = False
+    lanes: bool = True
+    rays: tuple[str, ...] = ()
+    hash_accesses: int = 0
+
+    def declared(self, lanes: int) -> Declared:
+        """Return what its rates are computed from, for work items of ``lanes`` paths."""
+        words = len(path_fields(*self.reads)) + len(path_fields(*self.writes))
+        return Declared(
+            items=lanes if self.lanes else 1,
+            bytes=4 * words + self.record_bytes,
+            per_sample=self.per_sample,
+            rays=self.rays,
+            hash_accesses=self.hash_accesses,
+        )
+
+
+@dataclass(frozen=True)
 class StageSpec:
     """A stage that runs.
 
@@ -38,9 +74,13 @@ class StageSpec:
     reason: str
     source: str
     flags: tuple[str, ...] = ()
-    kernels: tuple[str, ...] = ()
+    kernels: tuple[KernelSpec, ...] = ()
     buffers: tuple[BufferSpec, ...] = ()
     traces: bool = False
+
+    @property
+    def kernel_names(self) -> tuple[str, ...]:
+        return tuple(kernel.name for kernel in self.kernels)
 
     @property
     def sources(self) -> tuple[str, ...]:
