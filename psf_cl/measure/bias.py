@@ -83,8 +83,7 @@ def split_error(
     bias2 = float(block_bias2.sum())
     variances = [_own_variance(products, k) for k in range(count)]
     if count >= 4:
-        block_spread = _pair_mean_variance(products)
-        spread, freedom = _sum_with_freedom(block_spread)
+        spread, freedom = _sum_with_freedom(_pair_mean_variance(products))
     else:
         blocks = len(block_bias2)
         spread = float(np.var(block_bias2, ddof=1)) * blocks if blocks > 1 else math.nan
@@ -121,7 +120,10 @@ def _own_variance(products: np.ndarray, k: int) -> float:
 
 
 def _pair_mean_variance(products: np.ndarray) -> np.ndarray:
-    """Return, for each block, the variance of the mean over pairs, estimated without bias.
+    """Return, for each block, an estimate of the variance of the mean over pairs.
+
+    Without bias, but for this: what pairs that share one image have in common cannot be negative,
+    and is left out if its sum over the blocks comes out so.
 
     Args:
         products: ``(count, count, blocks)``, symmetric, count at least 4.
@@ -136,9 +138,10 @@ def _pair_mean_variance(products: np.ndarray) -> np.ndarray:
     mean_both = both / ordered
     mean_shared = shared / (ordered * (count - 2))
     mean_none = none / (ordered * (count - 2) * (count - 3))
-    return (
-        4.0 * (count - 2) * (mean_shared - mean_none) + 2.0 * (mean_both - mean_none)
-    ) / ordered
+    common = mean_shared - mean_none
+    if common.sum() < 0.0:
+        common = np.zeros_like(common)
+    return (4.0 * (count - 2) * common + 2.0 * (mean_both - mean_none)) / ordered
 
 
 def _sum_with_freedom(block_variances: np.ndarray) -> tuple[float, float]:

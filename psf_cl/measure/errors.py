@@ -95,7 +95,7 @@ def compare(image: np.ndarray, reference: np.ndarray, *, flip: bool = False) -> 
         return Errors(inf, inf, inf, inf, None, nonfinite)
     x, r = image[finite] * scale, reference[finite] * scale
     squared = (x - r) ** 2
-    relative = (squared / (r**2 + _RELATIVE_FLOOR)).mean(axis=-1)
+    relative = (squared * relative_weights(r)).mean(axis=-1)
     kept = relative.size - int(relative.size * _TRIMMED_SHARE)
     return Errors(
         mse=float(squared.mean()),
@@ -105,6 +105,11 @@ def compare(image: np.ndarray, reference: np.ndarray, *, flip: bool = False) -> 
         flip=_flip(image * scale, reference * scale) if flip and not nonfinite else None,
         nonfinite=nonfinite,
     )
+
+
+def relative_weights(reference: np.ndarray) -> np.ndarray:
+    """Return what relMSE multiplies squared differences with, for a normalised reference."""
+    return 1.0 / (reference**2 + _RELATIVE_FLOOR)
 
 
 def mean_luminance(reference: np.ndarray) -> float:
