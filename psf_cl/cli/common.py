@@ -108,16 +108,31 @@ def setting_argument(text: str) -> tuple[str, str]:
     return key.strip(), value.strip()
 
 
-def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add all that decides what is rendered and how: the same for ``render`` and ``plan``."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.epilog = _settings_help()
+def add_picture_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what decides what the picture is of."""
     parser.add_argument(
         "scene",
         metavar="SCENE",
         type=file_argument,
         help=".toml, .gltf, .glb, .obj, .ply or .stl",
     )
+    parser.add_argument(
+        "--size", metavar="WxH", type=size_argument, help="pixels; the vertical field of view stays"
+    )
+    parser.add_argument("--camera", metavar="NAME", help="a camera of the scene, by its name")
+    parser.add_argument(
+        "--environment",
+        metavar="FILE",
+        type=file_argument,
+        help="lat-long image (.exr, .hdr) as the scene's sky",
+    )
+
+
+def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add all that decides what is rendered and how: the same for ``render`` and ``plan``."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = _settings_help()
+    add_picture_arguments(parser)
     parser.add_argument("--preset", metavar="NAME", help=f"one of: {', '.join(PRESETS)}")
     parser.add_argument(
         "--set",
@@ -131,17 +146,7 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", metavar="N", help="the same as --set seed=N")
     parser.add_argument(
-        "--size", metavar="WxH", type=size_argument, help="pixels; the vertical field of view stays"
-    )
-    parser.add_argument(
         "--crop", metavar="X,Y,W,H", type=crop_argument, help="render only this part"
-    )
-    parser.add_argument("--camera", metavar="NAME", help="a camera of the scene, by its name")
-    parser.add_argument(
-        "--environment",
-        metavar="FILE",
-        type=file_argument,
-        help="lat-long image (.exr, .hdr) as the scene's sky",
     )
     parser.add_argument(
         "--aov",

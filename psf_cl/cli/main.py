@@ -78,13 +78,13 @@ def _end(code: int) -> NoReturn:
 
 def _parser() -> argparse.ArgumentParser:
     import psf_cl
-    from psf_cl.cli import compare, doctor, plan, render
+    from psf_cl.cli import compare, converge, doctor, plan, render
     from psf_cl.cli.common import Parser
 
     parser = Parser(prog="psf-cl", description="Path tracing on any OpenCL device.")
     parser.add_argument("--version", action="version", version=f"psf-cl {psf_cl.__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    for command in (render, plan, doctor, compare):
+    for command in (render, plan, doctor, converge, compare):
         command.add_parser(commands)
     return parser
 

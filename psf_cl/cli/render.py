@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
     # The device gets ready while the scene is read; a mistake in the scene does not wait for it.
     background = ThreadPoolExecutor(1)
     try:
-        opening = background.submit(_open_device, args.device, statistics)
+        opening = background.submit(open_prepared_device, args.device, statistics)
         scene, settings = load_with_settings(args)
         check_distinct(outputs, [*scene.files, args.reference])
         make_plan(scene, settings, args.aov, crop=args.crop)  # For its checks.
@@ -151,7 +151,8 @@ def run(args: argparse.Namespace) -> int:
     return 130 if stopped else 0
 
 
-def _open_device(text: str | None, profiling: bool) -> Device:
+def open_prepared_device(text: str | None, profiling: bool) -> Device:
+    """Open a device and make it ready, or say what a missing OpenCL needs."""
     try:
         from psf_cl.renderer import prepare_device
     except ImportError as error:
