@@ -30,7 +30,16 @@ _ALWAYS_FLOAT = ("depth", "samples")
 _HALF_MAX = 65504.0
 
 # Stats that are the same for the same render, so that equal images are equal files.
-_HEADER_STATS = ("scene", "settings", "seed", "spp", "device")
+_HEADER_STATS = (
+    "scene",
+    "settings",
+    "seed",
+    "spp",
+    "device",
+    "scene_digest",
+    "spp_per_seed",
+    "noise",
+)
 
 # Numbers in one file: a damaged header must not ask for more memory than this times 4 bytes.
 _MAX_VALUES = 1 << 30
