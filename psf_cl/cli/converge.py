@@ -103,7 +103,9 @@ def add_parser(commands: Any) -> None:
         help=f"runs of each contestant (default {DEFAULT_SEEDS}, the least for good intervals)",
     )
     parser.add_argument(
-        "--seed", metavar="N", default="0", help="of the first run; the others count on (default 0)"
+        "--seed",
+        metavar="N",
+        help="of the first run; the others count on (default: from the reference's last)",
     )
     parser.add_argument(
         "--device",
@@ -153,10 +155,9 @@ def run(args: argparse.Namespace) -> int:
         provenance=_provenance(args, arena, image),
         notes=_notes(args, contestants, image, reference.variance is not None, scene),
     )
+    seeds = _seeds(args, image, study)
     if not args.quiet:
         tell_notes([*scene.notes, *study.notes])
-    first_seed = Settings().with_values({"seed": args.seed}, "--").seed
-    seeds = [(first_seed + k) & 0xFFFFFFFF for k in range(args.seeds)]
     missing = sum(find_run(arena, one, seed) is None for one in contestants for seed in seeds)
     if not args.quiet:
         _tell_length(marks, missing, len(contestants) * len(seeds))
@@ -309,6 +310,22 @@ def _notes(
     if args.seeds < DEFAULT_SEEDS:
         notes.append(f"a claim needs at least {DEFAULT_SEEDS} seeds; these are {args.seeds}")
     return notes
+
+
+def _seeds(args: argparse.Namespace, image: Image, study: Study) -> list[int]:
+    """Return the runs' seeds: none of the reference's, whose noise would be theirs."""
+    stored = image.stats.get("seed")
+    taken = [s for s in (stored if isinstance(stored, list) else [stored]) if isinstance(s, int)]
+    first = max(taken, default=-1) + 1
+    if args.seed is not None:
+        first = Settings().with_values({"seed": args.seed}, "--").seed
+    seeds = [(first + k) & 0xFFFFFFFF for k in range(args.seeds)]
+    if set(seeds) & set(taken):
+        study.notes.append(
+            f"{args.reference} was made with some of the runs' seeds: errors look smaller than "
+            "they are"
+        )
+    return seeds
 
 
 def _settings_of(contestant: Contestant) -> dict[str, str]:

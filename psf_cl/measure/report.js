@@ -135,6 +135,7 @@
   });
   leftBox.value = pictures.length > 1 ? 1 : 0;
   rightBox.value = 0;
+  zoomBox.value = [4, 2, 1].find((zoom) => zoom * width <= 1024) ?? 1;
 
   for (const box of [leftBox, rightBox, modeBox, zoomBox])
     box.onchange = drawAll;

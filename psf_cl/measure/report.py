@@ -39,7 +39,7 @@ class Entry:
 
     Attributes:
         settings: name to value, or what it is called with.
-        failures: one line for each run that failed.
+        failures: one line for each run that failed: which, ": ", why.
     """
 
     name: str
@@ -225,7 +225,7 @@ def page(study: Study, figure: plot.Drawing) -> str:
     pictures, columns = _pictures(study)
     notes = [("note", note) for note in study.notes]
     for entry in study.entries:
-        notes += [("failed", f"{entry.name}: {failure}") for failure in entry.failures]
+        notes += [("failed", text) for text in _failure_texts(entry)]
         bad = sum(point.nonfinite for point in entry.points)
         if bad:
             notes.append(("failed", f"{entry.name}: {bad} pixels are not finite"))
@@ -262,6 +262,16 @@ def page(study: Study, figure: plot.Drawing) -> str:
     return pieces[0] + "".join(
         parts[name] + rest for name, _, rest in (piece.partition("}}") for piece in pieces[1:])
     )
+
+
+def _failure_texts(entry: Entry) -> list[str]:
+    """Return one line for each way to fail."""
+    kinds = dict.fromkeys(text.partition(": ")[2] for text in entry.failures)
+    counts = [sum(text.endswith(kind) for text in entry.failures) for kind in kinds]
+    return [
+        f"{entry.name}: {count} run{'s' * (count > 1)} failed: {kind}"
+        for kind, count in zip(kinds, counts, strict=True)
+    ]
 
 
 @dataclass(frozen=True)
@@ -372,7 +382,7 @@ def _settings_table(study: Study) -> str:
 
 def _name_cell(index: int, entry: Entry) -> _Cell:
     swatch = f'<span class="swatch" style="background: {_style(index)[0]}"></span>'
-    return _Cell(swatch + escape(entry.name), "text")
+    return _Cell(swatch + escape(entry.name), "name")
 
 
 def _interval_html(interval: Interval, form: str = ".3g") -> str:
