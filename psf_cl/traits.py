@@ -42,5 +42,13 @@ class DeviceTraits:
         path a work item, blocks of 32 so that neighbours read neighbouring words.
         """
         if kind == "cpu":
-            return cls("cpu", lanes=16, block=16, slots=1 << 15, group=8, few_triangles=160, few_corners=128)
+            return cls(
+                "cpu",
+                lanes=16,
+                block=16,
+                slots=1 << 15,
+                group=8,
+                few_triangles=160,
+                few_corners=128,
+            )
         return cls("gpu", lanes=1, block=32, slots=1 << 18, group=64)
