@@ -58,11 +58,15 @@ def test_triangles_and_normals_are_moved_to_the_world(name):
         expected = normals[mesh.triangles[:, corner]]
         np.testing.assert_allclose(geometry.normals[field], expected, atol=2e-6)
 
-    # The front stays the front: the object's face normal, moved, is flip times the world's.
+    # The front stays the front: the object's face normal, moved, is the world's.
     p = mesh.positions.astype(np.float64)[mesh.triangles]
     faces = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]) @ np.linalg.inv(matrix[:3, :3])
-    seen = np.cross(surfaces["e1"], surfaces["e2"]) * surfaces["flip"][:, None]
-    assert ((faces * seen).sum(axis=1) > 0).all()
+    faces /= np.linalg.norm(faces, axis=1, keepdims=True)
+    np.testing.assert_allclose(surfaces["ng"], faces, atol=2e-6)
+    # Far enough off to clear eight roundings of what a point is made of.
+    size = np.abs(corners).max(axis=(1, 2))
+    assert (surfaces["offset"] >= 8 * 2.0**-24 * size).all()
+    assert (surfaces["offset"] <= 64 * 2.0**-24 * size).all()
     for corner, field in enumerate(("uv0", "uv1", "uv2")):
         np.testing.assert_array_equal(geometry.uvs[field], mesh.uvs[mesh.triangles[:, corner]])
 

@@ -10,14 +10,7 @@
 #include "lanes.h"
 #include "layout.h"
 #include "alpha.h"
-
-/// Hits of all lanes; `triangle` is NO_HIT where there is none.
-typedef struct {
-    Float t;
-    Float u; // barycentric coordinate of the second corner
-    Float v; // barycentric coordinate of the third corner
-    UInt triangle;
-} Hits;
+#include "geometry.h"
 
 #if FEW // room for so many corners
 

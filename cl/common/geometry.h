@@ -27,6 +27,14 @@ typedef struct {
     uint triangle; // index without ALPHA_BIT, or NO_HIT
 } Hit;
 
+/// Hits of all lanes; `triangle` is NO_HIT where there is none.
+typedef struct {
+    Float t;
+    Float u; // barycentric coordinate of the second corner
+    Float v; // barycentric coordinate of the third corner
+    UInt triangle;
+} Hits;
+
 /// What depends on the ray alone: boxes' rows and planes, and the shear that turns the ray into z.
 typedef struct {
     float near_origin[3]; // the origin, moved back by its slack

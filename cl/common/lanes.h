@@ -42,7 +42,7 @@ typedef JOIN(int, W) Mask;
 
 // pick(mask, then, otherwise) for Float, pick_u for UInt, pick_m for Mask;
 // count_lanes(mask): how many; any_lane(mask): whether one; lanes_before(mask): how many lower ones a lane has;
-// lane_bits(mask): bit k is set where lane k is.
+// lane_bits(mask): bit k is set where lane k is; lanes_of(bits): back; least_lane(x): the least.
 // GATHER(array, index, member): array[index].member of every lane, GATHER_U the same for uint;
 // GATHER_WORD(array, index): array[index] of uints.
 #if W == 1
@@ -127,7 +127,9 @@ inline UInt lanes_before(Mask mask)
 }
 inline uint lane_bits(Mask mask)
 {
-#ifdef REDUCE_OR
+#if W == 16 && defined(__AVX512DQ__)
+    return (ushort)__builtin_ia32_cvtd2mask512(mask);
+#elif defined(REDUCE_OR)
     return (uint)REDUCE_OR(mask & LANE_BITS);
 #else
     int lane[W];
@@ -137,6 +139,18 @@ inline uint lane_bits(Mask mask)
         bits |= lane[k] ? 1u << k : 0u;
     return bits;
 #endif
+}
+inline Mask lanes_of(uint bits) { return ((Int)((int)bits) & LANE_BITS) != 0; }
+inline float least_lane(Float x)
+{
+#if W == 16
+    const JOIN(float, 8) a = min(x.lo, x.hi);
+#else
+    const Float a = x;
+#endif
+    const float4 b = min(a.lo, a.hi);
+    const float2 c = min(b.lo, b.hi);
+    return min(c.x, c.y);
 }
 #define WORDS_OF(array) ((uint)(sizeof(*(array)) / 4))
 #if W == 16 && defined(__AVX512F__)

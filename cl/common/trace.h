@@ -27,24 +27,7 @@ inline Hits closest_hits(
 #else
     RaySetups rays;
     set_up_rays(&rays, active, origin, direction, (Float)(INFINITY));
-    float t[W];
-    float u[W];
-    float v[W];
-    uint triangle[W];
-    for (uint k = 0; k < W; ++k) {
-        const RaySetup ray = ray_setup(&rays, k);
-        const Hit hit = trace_closest(nodes, blocks, &ray ALPHA_ARGUMENTS);
-        t[k] = hit.t;
-        u[k] = hit.u;
-        v[k] = hit.v;
-        triangle[k] = hit.triangle;
-    }
-    Hits hits;
-    hits.t = load_lanes(t);
-    hits.u = load_lanes(u);
-    hits.v = load_lanes(v);
-    hits.triangle = load_lanes_u(triangle);
-    return hits;
+    return trace_closest(nodes, blocks, &rays ALPHA_ARGUMENTS);
 #endif
 }
 
@@ -57,11 +40,6 @@ inline Mask blocked_rays(
 #else
     RaySetups rays;
     set_up_rays(&rays, active, origin, toward, (Float)(1.0f));
-    uint blocked[W];
-    for (uint k = 0; k < W; ++k) {
-        const RaySetup ray = ray_setup(&rays, k);
-        blocked[k] = trace_any(nodes, blocks, &ray ALPHA_ARGUMENTS);
-    }
-    return load_lanes_u(blocked) != 0u;
+    return trace_any(nodes, blocks, &rays ALPHA_ARGUMENTS);
 #endif
 }

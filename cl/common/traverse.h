@@ -45,23 +45,20 @@ static inline uint bits_of_8(int8 mask)
 #endif
 }
 
-/// Return the first hit of a ray; of equally near ones that of the lowest index.
-static inline Hit trace_closest(
+/// Look for hits of a ray below `next` (a child[]) that are nearer than `hit`; of equally near ones that
+/// of the lowest index counts.
+static inline void trace_closest_from(
     __global const BvhNode *nodes,
     __global const TriangleBlock *blocks,
-    const RaySetup *ray ALPHA_PARAMETERS)
+    const RaySetup *ray,
+    uint next,
+    Hit *hit ALPHA_PARAMETERS)
 {
-    Hit best;
-    best.t = ray->t_max;
-    best.u = 0.0f;
-    best.v = 0.0f;
-    // Index 0 loses every tie, so that t_max itself is out of range.
-    best.triangle = 0;
+    Hit best = *hit;
     uint waiting[STACK_SIZE];
     float entered[STACK_SIZE];
     uint count = 0;
-    uint next = 0;
-    bool more = ray->t_max > 0.0f;
+    bool more = true;
     while (more) {
         uint met;
         if (next & LEAF_BIT) {
@@ -136,20 +133,19 @@ static inline Hit trace_closest(
             next = waiting[count];
         }
     }
-    if (!(best.t < ray->t_max))
-        best.triangle = NO_HIT;
-    return best;
+    *hit = best;
 }
 
-/// Return whether anything lies on the ray before its t_max.
-static inline bool trace_any(
+/// Return whether anything below `first` (a child[]) lies on the ray before its t_max.
+static inline bool trace_any_from(
     __global const BvhNode *nodes,
     __global const TriangleBlock *blocks,
-    const RaySetup *ray ALPHA_PARAMETERS)
+    const RaySetup *ray,
+    uint first ALPHA_PARAMETERS)
 {
     uint waiting[STACK_SIZE];
-    waiting[0] = 0;
-    uint count = ray->t_max > 0.0f ? 1 : 0;
+    waiting[0] = first;
+    uint count = 1;
     bool blocked = false;
     while (count > 0 && !blocked) {
         const uint next = waiting[--count];
@@ -186,5 +182,172 @@ static inline bool trace_any(
     }
     return blocked;
 }
+
+#if W == 1
+/// Return the first hit of a ray; of equally near ones that of the lowest index.
+static inline Hits trace_closest(
+    __global const BvhNode *nodes, __global const TriangleBlock *blocks, const RaySetups *rays ALPHA_PARAMETERS)
+{
+    const RaySetup ray = ray_setup(rays, 0);
+    Hit best;
+    best.t = ray.t_max;
+    best.u = 0.0f;
+    best.v = 0.0f;
+    // Index 0 loses every tie, so that t_max itself is out of range.
+    best.triangle = 0;
+    if (ray.t_max > 0.0f)
+        trace_closest_from(nodes, blocks, &ray, 0, &best ALPHA_ARGUMENTS);
+    Hits hits;
+    hits.t = best.t;
+    hits.u = best.u;
+    hits.v = best.v;
+    hits.triangle = best.t < ray.t_max ? best.triangle : NO_HIT;
+    return hits;
+}
+
+/// Return whether anything lies on the ray before its t_max.
+static inline Mask trace_any(
+    __global const BvhNode *nodes, __global const TriangleBlock *blocks, const RaySetups *rays ALPHA_PARAMETERS)
+{
+    const RaySetup ray = ray_setup(rays, 0);
+    return ray.t_max > 0.0f && trace_any_from(nodes, blocks, &ray, 0 ALPHA_ARGUMENTS);
+}
+
+#else
+// Neighbours' rays share the upper part of their way: all lanes go down together as long as more than
+// these meet a box, then each on its own.  Where a ray is tested does not change what it hits.
+#ifndef LANES_APART
+#define LANES_APART 4
+#endif
+
+/// The boxes' part of the rays' setups, in lanes.
+typedef struct {
+    Vec3 near_origin;
+    Vec3 far_origin;
+    Vec3 inverse;
+    Mask backward_x;
+    Mask backward_y;
+    Mask backward_z;
+} Bundle;
+
+static inline Bundle bundle_of(const RaySetups *rays)
+{
+    Bundle b;
+    b.near_origin = vec3(load_lanes(rays->near_origin[0]), load_lanes(rays->near_origin[1]),
+                         load_lanes(rays->near_origin[2]));
+    b.far_origin = vec3(load_lanes(rays->far_origin[0]), load_lanes(rays->far_origin[1]),
+                        load_lanes(rays->far_origin[2]));
+    b.inverse = vec3(load_lanes(rays->inverse[0]), load_lanes(rays->inverse[1]), load_lanes(rays->inverse[2]));
+    b.backward_x = b.inverse.x < 0.0f;
+    b.backward_y = b.inverse.y < 0.0f;
+    b.backward_z = b.inverse.z < 0.0f;
+    return b;
+}
+
+/// As intersect_boxes: which rays may meet child `c` up to `limit`, and where they enter.
+static inline Mask intersect_box(
+    __global const BvhNode *node, uint c, const Bundle *rays, Float limit, Float *entry)
+{
+    const Float x0 = (Float)(node->bounds[0][c]);
+    const Float x1 = (Float)(node->bounds[1][c]);
+    const Float y0 = (Float)(node->bounds[2][c]);
+    const Float y1 = (Float)(node->bounds[3][c]);
+    const Float z0 = (Float)(node->bounds[4][c]);
+    const Float z1 = (Float)(node->bounds[5][c]);
+    const Float enter_x = (pick(rays->backward_x, x1, x0) - rays->near_origin.x) * rays->inverse.x;
+    const Float leave_x = (pick(rays->backward_x, x0, x1) - rays->far_origin.x) * rays->inverse.x;
+    const Float enter_y = (pick(rays->backward_y, y1, y0) - rays->near_origin.y) * rays->inverse.y;
+    const Float leave_y = (pick(rays->backward_y, y0, y1) - rays->far_origin.y) * rays->inverse.y;
+    const Float enter_z = (pick(rays->backward_z, z1, z0) - rays->near_origin.z) * rays->inverse.z;
+    const Float leave_z = (pick(rays->backward_z, z0, z1) - rays->far_origin.z) * rays->inverse.z;
+    Float near = (Float)(0.0f);
+    Float far = limit;
+    near = enter_x > near ? enter_x : near;
+    near = enter_y > near ? enter_y : near;
+    near = enter_z > near ? enter_z : near;
+    far = leave_x < far ? leave_x : far;
+    far = leave_y < far ? leave_y : far;
+    far = leave_z < far ? leave_z : far;
+    *entry = near;
+    return near <= far * BOX_FAR_FACTOR;
+}
+
+/// Return the first hits of the rays; of equally near ones that of the lowest index.
+///
+/// Each on its own: after a bounce rays of neighbours part too early for a common way to pay.
+static inline Hits trace_closest(
+    __global const BvhNode *nodes, __global const TriangleBlock *blocks, const RaySetups *rays ALPHA_PARAMETERS)
+{
+    float t[W];
+    float u[W];
+    float v[W];
+    uint triangle[W];
+    for (uint k = 0; k < W; ++k) {
+        const RaySetup ray = ray_setup(rays, k);
+        Hit best;
+        best.t = ray.t_max;
+        best.u = 0.0f;
+        best.v = 0.0f;
+        // Index 0 loses every tie, so that t_max itself is out of range.
+        best.triangle = 0;
+        if (ray.t_max > 0.0f)
+            trace_closest_from(nodes, blocks, &ray, 0, &best ALPHA_ARGUMENTS);
+        t[k] = best.t;
+        u[k] = best.u;
+        v[k] = best.v;
+        triangle[k] = best.t < ray.t_max ? best.triangle : NO_HIT;
+    }
+    Hits hits;
+    hits.t = load_lanes(t);
+    hits.u = load_lanes(u);
+    hits.v = load_lanes(v);
+    hits.triangle = load_lanes_u(triangle);
+    return hits;
+}
+
+/// Return whether anything lies on the rays before their t_max.
+static inline Mask trace_any(
+    __global const BvhNode *nodes, __global const TriangleBlock *blocks, const RaySetups *rays ALPHA_PARAMETERS)
+{
+    const Bundle bundle = bundle_of(rays);
+    const Float t_max = load_lanes(rays->t_max);
+    uint left = lane_bits(t_max > 0.0f);
+    uint blocked = 0;
+    uint entered[STACK_SIZE];
+    uint waiting[STACK_SIZE];
+    entered[0] = left;
+    waiting[0] = 0;
+    uint count = 1;
+    while (count > 0 && left) {
+        --count;
+        const uint next = waiting[count];
+        uint lanes = entered[count] & left;
+        if (!lanes)
+            continue;
+        if ((next & LEAF_BIT) || popcount(lanes) <= LANES_APART) {
+            do {
+                const uint k = lowest_bit(lanes);
+                lanes &= lanes - 1u;
+                const RaySetup ray = ray_setup(rays, k);
+                if (trace_any_from(nodes, blocks, &ray, next ALPHA_ARGUMENTS)) {
+                    blocked |= 1u << k;
+                    left &= ~(1u << k);
+                }
+            } while (lanes);
+            continue;
+        }
+        __global const BvhNode *node = &nodes[next];
+        for (uint c = 0; c < 8 && count < STACK_SIZE; ++c) {
+            Float entry;
+            const uint met = lanes & lane_bits(intersect_box(node, c, &bundle, t_max, &entry));
+            if (met) {
+                entered[count] = met;
+                waiting[count++] = node->child[c];
+            }
+        }
+    }
+    return lanes_of(blocked);
+}
+#endif
 
 #endif

@@ -29,14 +29,11 @@ kernel void sample_lights(
     global uint *extended)
 {
     const UInt seed = pixel_seed(LOAD_U(pixel, 0), params->seed);
-    const UInt index = LOAD_U(sample, 0);
+    const UInt index = reverse_bits(LOAD_U(sample, 0));
     const UInt pair = (UInt)(PAIR_VERTEX);
     UInt unused_bits;
     UInt choice;
     sample_bits(seed, index, pair + PAIR_CHOICE, params->sampler, &unused_bits, &choice);
-    Float unused;
-    Float alias_u;
-    sample_pair(seed, index, pair + PAIR_ROULETTE, params->sampler, &unused, &alias_u);
     const LightSample s = sample_light(params, lights, surfaces, materials,
 #if TEXTURES
                                        uvs, textures, texels, srgb_to_linear,
@@ -44,8 +41,7 @@ kernel void sample_lights(
 #if ENVIRONMENT == 2
                                        cells,
 #endif
-                                       LOAD_U(active, 0) != 0u, LOAD_V(origin, 0), seed, index, pair, choice,
-                                       alias_u);
+                                       LOAD_U(active, 0) != 0u, LOAD_V(origin, 0), seed, index, pair, choice);
     store_vec3(toward, 0, s.toward);
     store_vec3(wi, 0, s.wi);
     store_vec3(radiance, 0, s.radiance);

@@ -30,14 +30,15 @@ kernel void draw_samples(
     const uint sampler)
 {
     const UInt key = pixel_seed(LOAD_U(pixel, 0), seed);
+    const UInt reversed = reverse_bits(LOAD_U(index, 0));
     UInt a;
     UInt b;
-    sample_bits(key, LOAD_U(index, 0), LOAD_U(pair, 0), sampler, &a, &b);
+    sample_bits(key, reversed, LOAD_U(pair, 0), sampler, &a, &b);
     STORE_U(bits, 0, a);
     STORE_U(bits, 1, b);
     Float x;
     Float y;
-    sample_pair(key, LOAD_U(index, 0), LOAD_U(pair, 0), sampler, &x, &y);
+    sample_pair(key, reversed, LOAD_U(pair, 0), sampler, &x, &y);
     STORE(units, 0, x);
     STORE(units, 1, y);
 }

@@ -49,14 +49,21 @@ kernel void trace_closest_rays(
         return;
     RaySetups setups;
     load_rays(&setups, rays, first, ray_count);
+    const Hits hits = trace_closest(nodes, blocks, &setups ALPHA_ARGUMENTS);
+    uint triangle[W];
+    float t[W];
+    float u[W];
+    float v[W];
+    store_lanes_u(hits.triangle, triangle);
+    store_lanes(hits.t, t);
+    store_lanes(hits.u, u);
+    store_lanes(hits.v, v);
     for (uint k = 0; k < W && first + k < ray_count; ++k) {
-        const RaySetup ray = ray_setup(&setups, k);
-        const Hit hit = trace_closest(nodes, blocks, &ray ALPHA_ARGUMENTS);
         const size_t i = first + k;
-        triangles[i] = hit.triangle;
-        distances[3 * i] = hit.t;
-        distances[3 * i + 1] = hit.u;
-        distances[3 * i + 2] = hit.v;
+        triangles[i] = triangle[k];
+        distances[3 * i] = t[k];
+        distances[3 * i + 1] = u[k];
+        distances[3 * i + 2] = v[k];
     }
 }
 
@@ -75,8 +82,7 @@ kernel void trace_any_rays(
         return;
     RaySetups setups;
     load_rays(&setups, rays, first, ray_count);
-    for (uint k = 0; k < W && first + k < ray_count; ++k) {
-        const RaySetup ray = ray_setup(&setups, k);
-        blocked[first + k] = trace_any(nodes, blocks, &ray ALPHA_ARGUMENTS) ? 1 : 0;
-    }
+    const uint bits = lane_bits(trace_any(nodes, blocks, &setups ALPHA_ARGUMENTS));
+    for (uint k = 0; k < W && first + k < ray_count; ++k)
+        blocked[first + k] = bits >> k & 1u;
 }
