@@ -1,31 +1,30 @@
-// The tree, built in steps: references in Morton order, a binary tree over them from the bottom up,
-// wide nodes from the top down, their boxes from the bottom up.
+// The tree, built in steps: triangles in Morton order, a binary tree over them from the bottom up,
+// wide nodes from the top down, their bounds from the bottom up.
 //
-// A *reference* is a triangle and the box of it that the tree has to hold.  Node i < count of the
-// binary tree is the leaf of the i-th reference in Morton order; inner nodes follow as they are made,
-// so that children come before their parents.
+// Node i < count of the binary tree is the leaf of the i-th triangle in Morton order; inner nodes
+// follow as they are made, so that children come before their parents.
 //
-// Clusters, the roots of the forest so far, keep Morton order.  Each looks for the neighbour with
-// which it would make the smallest box; where two choose each other, they become one.
+// *Clusters*, the roots of the forest so far, stay in Morton order.  Each looks for the neighbour
+// with which it would make the smallest box; where two choose each other they become one.
 // Meister, Bittner: Parallel Locally-Ordered Clustering for Bounding Volume Hierarchy Construction,
 // TVCG 24 (3), 2018.
 //
-// Which subtrees become wide nodes and which blocks is chosen to cost least: a ray meets a box with
-// a chance proportional to its surface.
+// Which subtrees become wide nodes, and which blocks, is chosen to cost least.  Visiting either
+// costs 1 (their ratio, from 1 : 2 to 2 : 1, does not matter), and a ray that meets the scene's box
+// meets another with a chance proportional to its surface.
 // Ylitie, Karras, Laine: Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs,
 // HPG 2017, section 3.
 
 #include "common/geometry.h"
 
+#ifndef WIDTH
+#error "WIDTH must be the most children of a node: 2, 4 or 8"
+#endif
 #define BLOCK_TRIANGLES 4
-#define WIDTH 8
+#define NODE_LANES 8 // of BvhNode; narrower trees leave some empty
 #define NO_NODE 0xFFFFFFFFu
-#define RADIUS 16 // how far clusters look for a neighbour, in places; a multiple of 8
 #define GRID_BITS 21 // of the Morton grid, an axis; 3 * 21 = 63 key bits
-
-// What a ray pays for the boxes of a node and the triangles of a block.
-#define NODE_COST 1.0f
-#define BLOCK_COST 1.0f
+#define RADIUS 16 // how far clusters look for a neighbour, in places; a multiple of 8
 
 /// The corners of a box.
 typedef struct {
@@ -50,51 +49,51 @@ static inline void grow_box(Box *box, uint axis, float x)
     box->high[axis] = x > box->high[axis] ? x : box->high[axis];
 }
 
+/// A triangle's corners, vertex * 3 + axis.
+typedef struct {
+    float v[9];
+    Box box;
+    bool finite;
+} Triangle;
+
+static inline Triangle load_triangle(global const float *positions, uint index)
+{
+    Triangle triangle;
+    triangle.box = empty_box();
+    triangle.finite = true;
+    for (uint k = 0; k < 9; ++k) {
+        const float x = positions[9 * (size_t)index + k];
+        triangle.v[k] = x;
+        triangle.finite &= fabs(x) < INFINITY;
+        grow_box(&triangle.box, k % 3, x);
+    }
+    return triangle;
+}
+
 static inline float half_area(float3 size)
 {
     return size.x * size.y + size.y * size.z + size.z * size.x;
 }
 
-/// Count the references of each triangle: one if all of its coordinates are finite, else none.
+/// Find each triangle's box and whether all of its coordinates are finite.
 ///
 /// reads   positions[0, 9 * triangle_count)
-/// writes  pieces[i]
-kernel void count_references(
+/// writes  triangle_boxes[6 * i + (0..5)]: low x, y, z, high x, y, z, NaN if dropped; kept[i], 0 or 1
+kernel void prepare_triangles(
     global const float *positions,
-    global uint *pieces,
+    global float *triangle_boxes,
+    global uint *kept,
     const uint triangle_count)
 {
     const uint i = get_global_id(0);
     if (i >= triangle_count)
         return;
-    global const float *p = positions + 9 * (size_t)i;
-    uint finite = 1;
-    for (uint k = 0; k < 9; ++k)
-        finite &= fabs(p[k]) < INFINITY ? 1 : 0;
-    pieces[i] = finite;
-}
-
-/// Box the references.
-///
-/// reads   positions; triangles[0, count)
-/// writes  references[6 * i + (0..5)]: low x, y, z, high x, y, z
-kernel void box_references(
-    global const float *positions,
-    global const uint *triangles,
-    global float *references,
-    const uint count)
-{
-    const uint i = get_global_id(0);
-    if (i >= count)
-        return;
-    global const float *p = positions + 9 * (size_t)triangles[i];
-    Box box = empty_box();
-    for (uint k = 0; k < 9; ++k)
-        grow_box(&box, k % 3, p[k]);
+    const Triangle triangle = load_triangle(positions, i);
     for (uint axis = 0; axis < 3; ++axis) {
-        references[6 * (size_t)i + axis] = box.low[axis];
-        references[6 * (size_t)i + 3 + axis] = box.high[axis];
+        triangle_boxes[6 * (size_t)i + axis] = triangle.finite ? triangle.box.low[axis] : NAN;
+        triangle_boxes[6 * (size_t)i + 3 + axis] = triangle.finite ? triangle.box.high[axis] : NAN;
     }
+    kept[i] = triangle.finite ? 1 : 0;
 }
 
 /// Put two 0 bits before each of the low 21 bits.
@@ -115,41 +114,41 @@ static inline float in_frame(global const float *frame, uint axis, float x)
     return (0.5f * x - 0.5f * frame[axis]) * frame[3];
 }
 
-/// Code the centres of the references on a cubic grid over the scene.
+/// Code the centres of the kept triangles on a cubic grid over the scene.
 ///
-/// reads   references[0, 6 * count); frame: low x, y, z of the scene and 2 / its largest extent
-/// writes  codes[i]; order[i] = i
+/// reads   triangle_boxes; triangles[0, count), the kept ones; frame: low x, y, z of the scene and
+///         2 / its largest extent
+/// writes  codes[0, count)
 kernel void make_codes(
-    global const float *references,
+    global const float *triangle_boxes,
+    global const uint *triangles,
     global const float *frame,
     global ulong *codes,
-    global uint *order,
     const uint count)
 {
     const uint i = get_global_id(0);
     if (i >= count)
         return;
+    global const float *box = triangle_boxes + 6 * (size_t)triangles[i];
     const uint top = (1u << GRID_BITS) - 1;
     ulong code = 0;
     for (uint axis = 0; axis < 3; ++axis) {
-        const float low = references[6 * (size_t)i + axis];
-        const float high = references[6 * (size_t)i + 3 + axis];
-        const float from_low = 0.5f * (in_frame(frame, axis, low) + in_frame(frame, axis, high));
-        const uint cell = min((uint)(max(from_low, 0.0f) * (float)(1u << GRID_BITS)), top);
+        const float middle =
+            0.5f * (in_frame(frame, axis, box[axis]) + in_frame(frame, axis, box[3 + axis]));
+        const uint cell = min((uint)(max(middle, 0.0f) * (float)(1u << GRID_BITS)), top);
         code |= spread_bits(cell) << (2 - axis);
     }
     codes[i] = code;
-    order[i] = i;
 }
 
 /// Make the leaves and a cluster of each.
 ///
-/// reads   references; order[i]; frame
+/// reads   triangle_boxes; triangles[0, count), sorted; frame
 /// writes  tree, clusters, boxes as in find_nearest [0, count)
 kernel void make_leaves(
-    global const float *references,
+    global const float *triangle_boxes,
+    global const uint *triangles,
     global const float *frame,
-    global const uint *order,
     global BinaryNode *tree,
     global uint *clusters,
     global float *boxes,
@@ -159,7 +158,7 @@ kernel void make_leaves(
     const uint i = get_global_id(0);
     if (i >= count)
         return;
-    global const float *box = references + 6 * (size_t)order[i];
+    global const float *box = triangle_boxes + 6 * (size_t)triangles[i];
     global BinaryNode *leaf = &tree[i];
     for (uint axis = 0; axis < 3; ++axis) {
         leaf->low[axis] = in_frame(frame, axis, box[axis]);
@@ -167,12 +166,12 @@ kernel void make_leaves(
         boxes[axis * (size_t)stride + RADIUS + i] = leaf->low[axis];
         boxes[(3 + axis) * (size_t)stride + RADIUS + i] = leaf->high[axis];
     }
-    leaf->left = order[i];
+    leaf->left = triangles[i];
     leaf->right = LEAF_BIT;
     leaf->size = LEAF_BIT | 1;
-    const float cost = BLOCK_COST * half_area(vload3(0, leaf->high) - vload3(0, leaf->low));
-    for (uint k = 0; k < WIDTH - 1; ++k)
-        leaf->costs[k] = cost;
+    const float cost = half_area(vload3(0, leaf->high) - vload3(0, leaf->low));
+    for (uint k = 1; k < WIDTH; ++k)
+        leaf->costs[k - 1] = cost;
     clusters[i] = i;
 }
 
@@ -247,20 +246,20 @@ kernel void find_nearest(
 /// Mark the clusters that stay, alone or as the lower of a pair.
 ///
 /// reads   nearest[0, cluster_count)
-/// writes  stays[i], 0 or 1
+/// writes  places[i], 0 or 1; to be scanned
 kernel void mark_staying(
     global const uint *nearest,
-    global uint *stays,
+    global uint *places,
     const uint cluster_count)
 {
     const uint i = get_global_id(0);
     if (i >= cluster_count)
         return;
     const uint other = nearest[i];
-    stays[i] = other < i && nearest[other] == i ? 0 : 1;
+    places[i] = other < i && nearest[other] == i ? 0 : 1;
 }
 
-/// Find the least cost of a subtree as 1 to 7 children of a wide node.
+/// Find the least cost of a subtree as 1, at most 2 ... WIDTH - 1 children of a wide node.
 static inline void weigh_node(global BinaryNode *tree, uint index)
 {
     global BinaryNode *node = &tree[index];
@@ -277,9 +276,9 @@ static inline void weigh_node(global BinaryNode *tree, uint index)
         for (uint l = 1; l < k; ++l)
             parts[k] = min(parts[k], left[l] + right[k - l]);
     }
-    float cost = parts[WIDTH] + NODE_COST * area;
-    if (node->size <= BLOCK_TRIANGLES && BLOCK_COST * area <= cost) {
-        cost = BLOCK_COST * area;
+    float cost = parts[WIDTH] + area;
+    if (node->size <= BLOCK_TRIANGLES && area <= cost) {
+        cost = area;
         node->size |= LEAF_BIT;
     }
     for (uint k = 1; k < WIDTH; ++k) {
@@ -339,10 +338,12 @@ kernel void join_pairs(
     next_clusters[places[i]] = cluster;
 }
 
-/// Choose the children of each wide node of a level, inner ones first.
+/// Choose the children of each wide node of a level, inner ones first, each kind by surface.
+///
+/// A search for any hit takes the last child first: a block, and the one most likely to be met.
 ///
 /// reads   wide[level_start + i], its binary node; tree
-/// writes  children[8 * (level_start + i) + k], binary nodes, NO_NODE for none; inner_counts and
+/// writes  children[WIDTH * (level_start + i) + k], binary nodes, NO_NODE for none; inner_counts and
 ///         block_counts [level_start + i]; offsets[i], to be scanned
 kernel void open_nodes(
     global const BinaryNode *tree,
@@ -361,53 +362,56 @@ kernel void open_nodes(
     // What waits to be split further: a binary node and how many children it may become.
     uint names[WIDTH];
     uint shares[WIDTH];
-    uint chosen[WIDTH];
     names[0] = wide[index];
     shares[0] = WIDTH;
     uint waiting = 1;
+    uint chosen[WIDTH];
+    float areas[WIDTH];
     uint inner = 0;
-    uint blocks = 0;
+    uint filled = 0;
     while (waiting > 0) {
         --waiting;
         const uint name = names[waiting];
         uint share = shares[waiting];
-        const BinaryNode node = tree[name];
-        const bool block = (node.size & LEAF_BIT) != 0;
-        while (share > 1 && share < WIDTH && node.costs[share - 1] == node.costs[share - 2])
+        global const BinaryNode *node = &tree[name];
+        const bool block = (node->size & LEAF_BIT) != 0;
+        while (share > 1 && share < WIDTH && node->costs[share - 1] == node->costs[share - 2])
             --share;
-        if (node.right == LEAF_BIT || share == 1 || (share == WIDTH && block)) {
-            // Blocks fill the end.
-            if (block)
-                chosen[WIDTH - ++blocks] = name;
-            else
-                chosen[inner++] = name;
+        // With all shares it is the node itself, which is not its own child, or the only block.
+        if (share == 1 || (share == WIDTH && block)) {
+            const float area = half_area(vload3(0, node->high) - vload3(0, node->low));
+            uint place = filled++;
+            for (; place > 0; --place) {
+                const bool same_kind = block == (place > inner);
+                if (same_kind ? areas[place - 1] <= area : block)
+                    break;
+                chosen[place] = chosen[place - 1];
+                areas[place] = areas[place - 1];
+            }
+            chosen[place] = name;
+            areas[place] = area;
+            inner += block ? 0 : 1;
             continue;
         }
         float least = INFINITY;
         uint for_left = 1;
         for (uint k = 1; k < share; ++k) {
             const float cost =
-                tree[node.left].costs[k - 1] + tree[node.right].costs[share - k - 1];
+                tree[node->left].costs[k - 1] + tree[node->right].costs[share - k - 1];
             if (cost < least) {
                 least = cost;
                 for_left = k;
             }
         }
-        names[waiting] = node.left;
+        names[waiting] = node->left;
         shares[waiting++] = for_left;
-        names[waiting] = node.right;
+        names[waiting] = node->right;
         shares[waiting++] = share - for_left;
     }
-    for (uint k = 0; k < WIDTH; ++k) {
-        uint child = NO_NODE;
-        if (k < inner)
-            child = chosen[k];
-        else if (k - inner < blocks)
-            child = chosen[WIDTH - 1 - (k - inner)];
-        children[WIDTH * (size_t)index + k] = child;
-    }
+    for (uint k = 0; k < WIDTH; ++k)
+        children[WIDTH * (size_t)index + k] = k < filled ? chosen[k] : NO_NODE;
     inner_counts[index] = inner;
-    block_counts[index] = blocks;
+    block_counts[index] = filled - inner;
     offsets[i] = inner;
 }
 
@@ -499,6 +503,8 @@ kernel void place_children(
 }
 
 /// Set the bounds of a child, with the slack that the rounding of its corners needs.
+///
+/// Whatever holds these bounds needs no more: a ray that meets them meets it.
 static inline void set_bounds(global BvhNode *node, uint k, Box box)
 {
     float reach = 0.0f;
@@ -511,15 +517,12 @@ static inline void set_bounds(global BvhNode *node, uint k, Box box)
     }
 }
 
-/// Write the wide nodes and their blocks, but for the bounds of inner children.
+/// Link the wide nodes and fill their blocks, but for everything that depends on where corners are.
 ///
-/// reads   positions, references, triangles; tree; children, inner_counts, block_counts, places,
-///         node_starts, block_starts; alpha_flags[triangle] if has_alpha
-/// writes  nodes[0, node_count), blocks
-kernel void fill_nodes(
-    global const float *positions,
-    global const float *references,
-    global const uint *triangles,
+/// reads   tree; children, inner_counts, block_counts, places, node_starts, block_starts;
+///         alpha_flags[triangle] if has_alpha
+/// writes  nodes[0, node_count).child, blocks.id
+kernel void link_nodes(
     global const uint *alpha_flags,
     global const BinaryNode *tree,
     global const uint *children,
@@ -538,41 +541,67 @@ kernel void fill_nodes(
         return;
     global BvhNode *node = &nodes[places[index]];
     const uint inner = inner_counts[index];
-    for (uint k = 0; k < WIDTH; ++k) {
-        node->child[k] = k < inner ? node_starts[index] + k : 0;
+    for (uint k = 0; k < NODE_LANES; ++k) {
         node->unused[k] = 0;
-        set_bounds(node, k, empty_box());
+        node->child[k] = k < inner ? node_starts[index] + k : 0;
         if (k < inner || k - inner >= block_counts[index])
             continue;
         const uint place = block_starts[index] + k - inner;
-        global TriangleBlock *block = &blocks[place];
         node->child[k] = LEAF_BIT | place;
-        Box box = empty_box();
         uint waiting[BLOCK_TRIANGLES];
         waiting[0] = children[WIDTH * (size_t)index + k];
         uint count = 1;
         uint lane = 0;
         while (count > 0) {
             global const BinaryNode *below = &tree[waiting[--count]];
-            if (below->right != LEAF_BIT) {
+            if (below->right == LEAF_BIT) {
+                const uint triangle = below->left;
+                const uint alpha = has_alpha && alpha_flags[triangle] != 0 ? ALPHA_BIT : 0;
+                blocks[place].id[lane++] = triangle | alpha;
+            } else {
                 waiting[count++] = below->right;
                 waiting[count++] = below->left;
-                continue;
             }
-            const uint triangle = triangles[below->left];
-            for (uint c = 0; c < 9; ++c)
-                block->v[c][lane] = positions[9 * (size_t)triangle + c];
-            for (uint c = 0; c < 6; ++c)
-                grow_box(&box, c % 3, references[6 * (size_t)below->left + c]);
-            const uint alpha = has_alpha && alpha_flags[triangle] != 0 ? ALPHA_BIT : 0;
-            block->id[lane++] = triangle | alpha;
+        }
+        for (; lane < BLOCK_TRIANGLES; ++lane)
+            blocks[place].id[lane] = NO_HIT;
+    }
+}
+
+/// Copy the triangles of each wide node's blocks side by side, and bound its children but inner ones.
+///
+/// A triangle that is not finite now is not there: all NaN, outside of every box.
+///
+/// reads   positions; nodes[0, node_count).child; blocks.id
+/// writes  blocks.v; nodes.bounds
+kernel void fit_blocks(
+    global const float *positions,
+    global BvhNode *nodes,
+    global TriangleBlock *blocks,
+    const uint node_count)
+{
+    const uint index = get_global_id(0);
+    if (index >= node_count)
+        return;
+    global BvhNode *node = &nodes[index];
+    for (uint k = 0; k < NODE_LANES; ++k) {
+        Box box = empty_box();
+        if ((node->child[k] & LEAF_BIT) != 0) {
+            global TriangleBlock *block = &blocks[node->child[k] & ~LEAF_BIT];
+            for (uint lane = 0; lane < BLOCK_TRIANGLES; ++lane) {
+                const uint id = block->id[lane];
+                Triangle triangle;
+                triangle.finite = false;
+                if (id != NO_HIT)
+                    triangle = load_triangle(positions, id & ~ALPHA_BIT);
+                for (uint c = 0; c < 9; ++c) {
+                    block->v[c][lane] = triangle.finite ? triangle.v[c] : NAN;
+                    if (triangle.finite)
+                        grow_box(&box, c % 3, triangle.v[c]);
+                }
+            }
         }
         set_bounds(node, k, box);
-        for (; lane < BLOCK_TRIANGLES; ++lane) {
-            for (uint c = 0; c < 9; ++c)
-                block->v[c][lane] = NAN;
-            block->id[lane] = NO_HIT;
-        }
     }
 }
 
@@ -589,18 +618,20 @@ kernel void fit_nodes(
     if (get_global_id(0) >= level_count)
         return;
     global BvhNode *node = &nodes[places[level_start + get_global_id(0)]];
-    for (uint k = 0; k < WIDTH; ++k) {
+    for (uint k = 0; k < NODE_LANES; ++k) {
         const uint child = node->child[k];
         // The root is nobody's child: 0 is none.
         if (child == 0 || (child & LEAF_BIT) != 0)
             continue;
-        for (uint row = 0; row < 6; ++row) {
-            const float8 bounds = vload8(0, nodes[child].bounds[row]);
-            const float4 low4 = min(bounds.lo, bounds.hi);
-            const float2 low2 = min(low4.lo, low4.hi);
-            const float4 high4 = max(bounds.lo, bounds.hi);
-            const float2 high2 = max(high4.lo, high4.hi);
-            node->bounds[row][k] = (row & 1) != 0 ? max(high2.x, high2.y) : min(low2.x, low2.y);
+        for (uint axis = 0; axis < 3; ++axis) {
+            float low = INFINITY;
+            float high = -INFINITY;
+            for (uint lane = 0; lane < NODE_LANES; ++lane) {
+                low = min(low, nodes[child].bounds[2 * axis][lane]);
+                high = max(high, nodes[child].bounds[2 * axis + 1][lane]);
+            }
+            node->bounds[2 * axis][k] = low;
+            node->bounds[2 * axis + 1][k] = high;
         }
     }
 }

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psf_cl.device.bvh import build_bvh
+from psf_cl.device.bvh import Refit, build_bvh, visit_cost
 from psf_cl.device.layout import CONSTANT
 from psf_cl.device.program import load_program
 
@@ -18,16 +18,31 @@ ALPHA_BIT = CONSTANT["ALPHA_BIT"]
 class Traced:
     """Triangles, ``(n, 3, 3)``, with their tree on the device."""
 
-    def __init__(self, device, triangles, alpha=None):
+    def __init__(self, device, triangles, alpha=None, width=8):
         self.device = device
         self.triangles = np.ascontiguousarray(triangles, np.float32).reshape(-1, 3, 3)
         count = len(self.triangles)
         positions = device.upload("positions", self.triangles)
         flags = None if alpha is None else device.upload("alpha", np.asarray(alpha, np.uint32))
-        self.bvh = build_bvh(device, positions, count, flags)
+        self.bvh = build_bvh(device, positions, count, flags, width)
         device.release(positions, *([] if flags is None else [flags]))
-        self.nodes = device.read(self.bvh.nodes, self.bvh.node_count)
-        self.blocks = device.read(self.bvh.blocks, self.bvh.block_count)
+        self.read()
+
+    def read(self):
+        self.nodes = self.device.read(self.bvh.nodes, self.bvh.node_count)
+        self.blocks = self.device.read(self.bvh.blocks, self.bvh.block_count)
+
+    def refit(self, triangles):
+        """Move the triangles; return the ratio of the costs."""
+        self.triangles = np.ascontiguousarray(triangles, np.float32).reshape(-1, 3, 3)
+        positions = self.device.upload("positions", self.triangles)
+        refit = Refit(self.device, self.bvh)
+        refit.fit(positions)
+        ratio = refit.cost_ratio()
+        self.device.release(positions)
+        refit.release()
+        self.read()
+        return ratio
 
     def release(self):
         self.device.release(self.bvh.nodes, self.bvh.blocks)
@@ -72,8 +87,8 @@ class Traced:
 def traced(device):
     made = []
 
-    def build(triangles, alpha=None):
-        made.append(Traced(device, triangles, alpha))
+    def build(triangles, alpha=None, width=8):
+        made.append(Traced(device, triangles, alpha, width))
         return made[-1]
 
     yield build
@@ -289,6 +304,19 @@ def test_cut_out_triangles_count_only_where_they_are_there(traced):
         assert (hit[sure].any(axis=1) & (expected[sure] != t[sure].argmin(axis=1))).sum() > 10
 
 
+@pytest.mark.parametrize("width", [2, 4])
+@pytest.mark.parametrize("count", [0, 1, 2, 5, 1000])
+def test_narrow_trees_give_the_same_hits(traced, width, count):
+    triangles = soup(count)
+    wide, narrow = traced(triangles), traced(triangles, width=width)
+    check_tree(narrow)
+    assert (narrow.nodes["child"][:, width:] == 0).all()
+    rays = rays_through(2000)
+    for expected, found in zip(wide.closest(rays), narrow.closest(rays), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(narrow.any(rays), wide.any(rays))
+
+
 def leaf_ids(tree):
     ids = tree.blocks["id"]
     return ids[ids != NO_HIT] & ~np.uint32(ALPHA_BIT)
@@ -332,7 +360,7 @@ def check_tree(tree):
     assert sorted(seen_nodes) == list(range(tree.bvh.node_count))
     assert sorted(seen_blocks) == list(range(tree.bvh.block_count))
     assert deepest == tree.bvh.depth
-    assert tree.bvh.stack_size >= 7 * deepest + 1
+    assert tree.bvh.stack_size >= (tree.bvh.width - 1) * deepest + 1
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 4, 5, 6, 8, 9, 33, 64, 65, 5000])
@@ -344,7 +372,55 @@ def test_leaves_and_nodes_are_well_filled(traced):
     tree = traced(soup(5000, size=0.1))
     assert len(leaf_ids(tree)) / tree.bvh.block_count > 2
     # Every node but the root is one child, every block is one.
-    assert (tree.bvh.node_count + tree.bvh.block_count - 1) / tree.bvh.node_count > 4
+    assert (tree.bvh.node_count + tree.bvh.block_count - 1) / tree.bvh.node_count > 6
+
+
+def halves_cost(triangles):
+    """Return the visits of a tree by halving the longest axis at its median, eight children a node.
+
+    Not a good tree, but a plain one to be better than.
+    """
+    low, high = triangles.min(axis=1), triangles.max(axis=1)
+
+    def parts(members, levels):
+        if levels == 0 or len(members) <= 4:
+            return [members]
+        centers = low[members] + high[members]
+        axis = np.ptp(centers, axis=0).argmax()
+        ordered = members[np.argsort(centers[:, axis], kind="stable")]
+        half = len(members) // 2
+        return parts(ordered[:half], levels - 1) + parts(ordered[half:], levels - 1)
+
+    def area(members):
+        size = (high[members].max(axis=0) - low[members].min(axis=0)).astype(np.float64)
+        return size[0] * size[1] + size[1] * size[2] + size[2] * size[0]
+
+    total, stack = 0.0, [np.arange(len(triangles))]
+    while stack:
+        members = stack.pop()
+        total += area(members)
+        stack += parts(members, 3) if len(members) > 4 else []
+    return total / area(np.arange(len(triangles)))
+
+
+def test_a_tree_costs_less_than_one_of_halves(traced):
+    # Small triangles in clumps, and a few that span the scene.
+    rng = np.random.default_rng(9)
+    clumps = rng.uniform(-1, 1, (40, 1, 1, 3)) + 0.05 * rng.normal(size=(40, 100, 1, 3))
+    small = (clumps + 0.01 * rng.normal(size=(40, 100, 3, 3))).reshape(-1, 3, 3)
+    triangles = np.concatenate([small, rng.uniform(-1, 1, (20, 3, 3))]).astype(np.float32)
+    cost = visit_cost(traced(triangles).nodes)
+    assert cost < 0.8 * halves_cost(triangles)
+
+
+def test_the_cost_counts_the_boxes_by_their_surface(traced):
+    # Two blocks: four triangles that fill the unit cube's box, and four in a corner of it.
+    big = np.tile([[[0, 0, 0], [1, 1, 0], [1, 1, 1]]], (4, 1, 1))
+    small = 0.25 * big + 0.75
+    tree = traced(np.concatenate([big, small]))
+    assert (tree.bvh.node_count, tree.bvh.block_count) == (1, 2)
+    # The node, a block in all of the box, one in a box of 1/16 of the surface.
+    np.testing.assert_allclose(visit_cost(tree.nodes), 1 + 1 + 1 / 16, rtol=1e-5)
 
 
 def test_alpha_flags_reach_the_leaves(traced):
@@ -362,10 +438,71 @@ def test_a_rebuild_gives_the_same_bits(traced):
 
 
 def test_equal_triangles_make_a_shallow_tree(traced):
-    tree = traced(np.repeat(soup(1), 10_000, axis=0))
-    check_tree(tree)
+    tree = traced(np.repeat(soup(1), 100_000, axis=0))
     assert tree.bvh.depth <= 8
-    assert set(tree.closest(rays_through(1000))[0]) == {0, NO_HIT}
+    assert len(leaf_ids(tree)) == 100_000
+    assert set(tree.closest(rays_through(200))[0]) == {0, NO_HIT}
+
+
+def test_nested_triangles_make_a_tree_of_bounded_depth(traced):
+    # Of one centre, in the order of their sizes: every box is nearest to the one before it, so that
+    # only the first two choose each other.
+    count = 3000
+    sizes = 1 + np.arange(count) / 1000
+    corners = np.array([[-1, -1, -1], [1, 1, 1], [1, -1, 1]])
+    tree = traced(sizes[:, None, None] * corners)
+    check_tree(tree)
+    # At the worst every other round joins one of 8.
+    assert tree.bvh.depth <= 2 * np.log(count) / np.log(8 / 7)
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 5, 3000])
+def test_a_refit_without_moves_gives_the_same_bits(traced, count):
+    tree = traced(soup(count))
+    nodes, blocks = tree.nodes.tobytes(), tree.blocks.tobytes()
+    assert tree.refit(tree.triangles) == 1.0
+    assert (tree.nodes.tobytes(), tree.blocks.tobytes()) == (nodes, blocks)
+
+
+def test_hits_after_a_refit_equal_brute_force(traced):
+    tree = traced(soup(1000), alpha=np.arange(1000) % 3 == 0)
+    links = tree.nodes["child"].copy(), tree.blocks["id"].copy()
+    turn = np.array([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1]])
+    moved = (tree.triangles @ turn + 0.1 * np.sin(5 * tree.triangles)).astype(np.float32)
+    tree.refit(moved)
+    check_tree(tree)
+    check_against_brute_force(tree, rays_through(2000))
+    np.testing.assert_array_equal(tree.nodes["child"], links[0])
+    np.testing.assert_array_equal(tree.blocks["id"], links[1])
+
+
+def test_a_refit_tells_when_the_tree_no_longer_suits(traced):
+    triangles = soup(2000, size=0.02)
+    tree = traced(triangles)
+    np.testing.assert_allclose(tree.refit(2 * triangles + 1), 1.0, rtol=1e-3)
+    tree = traced(triangles)
+    shuffled = np.random.default_rng(10).permutation(2000)
+    ratio = tree.refit(triangles[shuffled])
+    assert ratio > 5
+    check_against_brute_force(tree, rays_through(500))
+
+
+def test_a_triangle_that_is_not_finite_after_a_move_comes_back(traced):
+    triangles = soup(300)
+    tree = traced(triangles)
+    rays = rays_through(2000)
+    found, distances = tree.closest(rays)
+    gone = [int(k) for k in np.unique(found[found != NO_HIT])[:5]]
+    broken = triangles.copy()
+    broken[gone, 1, 2] = [np.nan, np.inf, -np.inf, np.nan, np.inf]
+    tree.refit(broken)
+    left, _ = tree.closest(rays)
+    assert not np.isin(left, gone).any()
+    np.testing.assert_array_equal(left[~np.isin(found, gone)], found[~np.isin(found, gone)])
+    tree.refit(triangles)
+    again, distances_again = tree.closest(rays)
+    np.testing.assert_array_equal(again, found)
+    np.testing.assert_array_equal(distances_again, distances)
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e-12, 1e12, 1e30])

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from psf_cl.device.device import Buffer, Device
-from psf_cl.device.layout import BINARY_NODE, BVH_NODE, TRIANGLE_BLOCK
+from psf_cl.device.layout import BINARY_NODE, BVH_NODE, CONSTANT, TRIANGLE_BLOCK
 from psf_cl.device.primitives import Primitives
-from psf_cl.device.program import Launch, load_program
+from psf_cl.device.program import Launch, Program, load_program
 
 #: Triangles that a tree takes at most: the binary tree has twice as many nodes, LEAF_BIT apart.
 MOST_TRIANGLES = 1 << 29
 
-#: Children of a node.
-WIDTH = 8
+#: Children that a BvhNode has room for.
+NODE_LANES = 8
 
 MIN_STACK_SIZE = 128
 _STACK_STEP = 32
@@ -37,6 +37,7 @@ _NO_SPAN = 1 << 31
 
 _NODE_NUMBERS = (
     "wide",
+    "offsets",
     "firsts",
     "inner_counts",
     "block_counts",
@@ -50,16 +51,18 @@ _NODE_NUMBERS = (
 
 @dataclass(frozen=True)
 class Bvh:
-    """A tree of eight children a node over blocks of up to four triangles; the caller releases it.
+    """A tree of wide nodes over blocks of up to four triangles; the caller releases it.
 
     Node 0 is the root, also of no triangles.  The same triangles give the same bits.
 
     Attributes:
         nodes: ``BvhNode``, ``node_count`` items, depth first: the children of a node side by side.
+            Of a node's children inner ones come first, and among either kind larger ones last.
         blocks: ``TriangleBlock``, ``block_count`` items in the same order (one unused item if there
             are none).
-        depth: levels of nodes; no more than rounds of clustering, see ``_SHORT_SPAN``.
+        depth: levels of nodes, at most as many as there were rounds of clustering.
         dropped: triangles that are not in the tree because a coordinate is not finite.
+        width: children that a node has at most.
     """
 
     nodes: Buffer
@@ -68,18 +71,24 @@ class Bvh:
     block_count: int
     depth: int
     dropped: int
+    width: int
 
     @property
     def stack_size(self) -> int:
-        """Entries that a traversal can need: each level leaves 7 behind, the last one adds 8.
+        """Entries that a traversal can need: each level leaves width - 1, the last one adds width.
 
         Rounded up, so that scenes share compiled kernels.
         """
-        return max(-(-(7 * self.depth + 1) // _STACK_STEP) * _STACK_STEP, MIN_STACK_SIZE)
+        needed = (self.width - 1) * self.depth + 1
+        return max(-(-needed // _STACK_STEP) * _STACK_STEP, MIN_STACK_SIZE)
 
 
 def build_bvh(
-    device: Device, positions: Buffer, triangle_count: int, alpha_flags: Buffer | None = None
+    device: Device,
+    positions: Buffer,
+    triangle_count: int,
+    alpha_flags: Buffer | None = None,
+    width: int = NODE_LANES,
 ) -> Bvh:
     """Build the tree over ``triangle_count`` triangles and wait for it.
 
@@ -89,6 +98,7 @@ def build_bvh(
     Args:
         positions: float32, nine items a triangle: the corners p0, p1, p2 in world space, m.
         alpha_flags: uint32 a triangle, not 0 if a hit must be looked up in its alpha texture.
+        width: children that a node gets at most: 2, 4 or 8.
 
     Raises:
         DeviceError: the device has no room.
@@ -100,22 +110,11 @@ def build_bvh(
     """
     if triangle_count > MOST_TRIANGLES:
         raise ValueError(f"{triangle_count} triangles; a tree takes at most {MOST_TRIANGLES}")
-    build = _Build(device, positions, triangle_count, alpha_flags)
+    build = TreeBuild(device, positions, triangle_count, alpha_flags, width)
     try:
-        build.make_references()
-        build.sort_references()
+        build.sort_triangles()
         build.join_clusters()
-        build.open_nodes()
-        build.fill_nodes()
-        device.wait()
-        return Bvh(
-            nodes=build.keep("nodes"),
-            blocks=build.keep("blocks"),
-            node_count=build.scalars["node_count"],
-            block_count=build.scalars["block_count"],
-            depth=max(len(build.levels), 1),
-            dropped=triangle_count - build.scalars["count"],
-        )
+        return build.finish()
     finally:
         build.release()
 
@@ -133,19 +132,112 @@ def warm_up_builder(device: Device) -> float:
     return time.perf_counter() - start
 
 
-class _Build:
-    """The buffers and numbers of one build, under the names of the kernels' parameters."""
+def visit_cost(nodes: np.ndarray) -> float:
+    """Return how many nodes and blocks a ray that meets the scene's box visits by its surfaces.
+
+    Args:
+        nodes: ``BvhNode``, all of a tree, root first.
+    """
+    bounds = nodes["bounds"].astype(np.float64)
+    used = bounds[:, 0] <= bounds[:, 1]
+    size = np.where(used[:, None], bounds[:, 1::2] - bounds[:, ::2], 0.0)
+    area = size[:, 0] * size[:, 1] + size[:, 1] * size[:, 2] + size[:, 2] * size[:, 0]
+    whole = bounds[0, 1::2].max(axis=1) - bounds[0, ::2].min(axis=1)
+    root = whole[0] * whole[1] + whole[1] * whole[2] + whole[2] * whole[0]
+    return 1.0 + float(area.sum() / root) if used.any() and root > 0.0 else 1.0
+
+
+class Refit:
+    """Fits a tree to triangles that have moved: other boxes, the same nodes and blocks.
+
+    Triangles that were dropped from the tree stay out of it; one that is not finite now is not hit
+    until it is finite again.
+    """
+
+    def __init__(self, device: Device, bvh: Bvh) -> None:
+        self.device = device
+        self.bvh = bvh
+        nodes = device.read(bvh.nodes, bvh.node_count)
+        self.built_cost = visit_cost(nodes)
+        levels = [np.zeros(1, np.uint32)]
+        while len(levels[-1]):
+            children = nodes["child"][levels[-1]].reshape(-1)
+            levels.append(children[(children != 0) & (children < CONSTANT["LEAF_BIT"])])
+        self.places = device.upload("places", np.concatenate(levels))
+        self.levels = _level_ranges([len(level) for level in levels[:-1]])
+        self.program = _load(device, bvh.width)
+
+    def release(self) -> None:
+        """Give back what is the refit's own; the tree stays."""
+        self.device.release(self.places)
+
+    def fit(self, positions: Buffer) -> None:
+        """Enqueue fitting the tree to ``positions``, of the same triangles as it was built from."""
+        _fit(self.program, self.bvh, self.places, self.levels, positions)
+
+    def cost_ratio(self) -> float:
+        """Return by how much the moves have made a ray dearer; from 1.3 on a new tree may pay."""
+        nodes = self.device.read(self.bvh.nodes, self.bvh.node_count)
+        return visit_cost(nodes) / self.built_cost
+
+
+def _load(device: Device, width: int) -> Program:
+    return load_program(device, "bvh.cl", {"WIDTH": width})
+
+
+def _level_ranges(sizes: list[int]) -> list[tuple[int, int]]:
+    """Return the first node and the number of nodes of each level."""
+    return [(sum(sizes[:level]), size) for level, size in enumerate(sizes)]
+
+
+def _fit(
+    program: Program,
+    bvh: Bvh,
+    places: Buffer,
+    levels: list[tuple[int, int]],
+    positions: Buffer,
+) -> None:
+    """Enqueue writing all corners and bounds.
+
+    Args:
+        places: uint32, the nodes level by level.
+        levels: where in ``places`` each level starts, and how many nodes it has.
+    """
+    program.bind(
+        "fit_blocks",
+        positions=positions,
+        nodes=bvh.nodes,
+        blocks=bvh.blocks,
+        node_count=bvh.node_count,
+    )(bvh.node_count, group=_GROUP)
+    launch = program.bind("fit_nodes", places=places, nodes=bvh.nodes, level_start=0, level_count=0)
+    # The last level has no inner children.
+    for start, count in reversed(levels[:-1]):
+        launch.set(level_start=start, level_count=count)(count, group=_GROUP)
+
+
+class TreeBuild:
+    """The buffers and numbers of one build, under the names of the kernels' parameters.
+
+    Its steps in order; instead of ``join_clusters`` something else may fill ``own["tree"]``.
+    """
 
     def __init__(
-        self, device: Device, positions: Buffer, triangle_count: int, alpha_flags: Buffer | None
+        self,
+        device: Device,
+        positions: Buffer,
+        triangle_count: int,
+        alpha_flags: Buffer | None = None,
+        width: int = NODE_LANES,
     ) -> None:
         self.device = device
-        self.program = load_program(device, "bvh.cl")
+        self.width = width
+        self.program = _load(device, width)
         self.primitives = Primitives(device)
+        self.launches: dict[str, Launch] = {}
+        self.positions = positions
         self.given: dict[str, Buffer] = {"positions": positions}
         self.own: dict[str, Buffer] = {}
-        self.launches: dict[str, Launch] = {}
-        self.levels: list[tuple[int, int]] = []
         self.scalars = {"triangle_count": triangle_count, "has_alpha": int(alpha_flags is not None)}
         if alpha_flags is None:
             self.allocate("alpha_flags", np.uint32, 1)
@@ -155,10 +247,6 @@ class _Build:
     def allocate(self, name: str, dtype: Any, count: int) -> Buffer:
         self.own[name] = self.device.allocate(name, dtype, count)
         return self.own[name]
-
-    def keep(self, name: str) -> Buffer:
-        """Hand a buffer over to the caller."""
-        return self.own.pop(name)
 
     def release(self, *names: str) -> None:
         """Give the named buffers back; without names, everything."""
@@ -178,113 +266,119 @@ class _Build:
             launch.set(**{name: values[name] for name in held if values[name] is not held[name]})
         launch(items, group=_GROUP)
 
-    def count_set(self, flags: str, indices: str, count: int) -> int:
-        """Write the indices of the set flags; return how many there are."""
-        scratch = self.allocate("ranks", np.uint32, count)
-        total = self.primitives.compact(self.own[flags], scratch, self.own[indices], count)
-        found = int(self.device.read(total)[0])
-        self.release("ranks")
-        return found
+    def swap(self, *names: str) -> None:
+        """Exchange buffers with the ones that hold their next state."""
+        for name in names:
+            spare = f"next_{name}"
+            self.own[name], self.own[spare] = self.own[spare], self.own[name]
 
-    def make_references(self) -> None:
-        """Leave the boxes of what is finite in ``references``, and their ``triangles``."""
+    def sort_triangles(self) -> None:
+        """Leave in ``triangles`` what is finite, sorted along the Morton curve."""
         triangle_count = self.scalars["triangle_count"]
-        self.allocate("pieces", np.uint32, triangle_count)
-        self.run("count_references", triangle_count)
-        self.allocate("triangles", np.uint32, triangle_count)
-        count = self.scalars["count"] = self.count_set("pieces", "triangles", triangle_count)
-        self.release("pieces")
-        references = self.allocate("references", np.float32, 6 * count)
-        self.run("box_references", count)
-        bounds = self.device.read(self.primitives.bounds(references, 2 * count)).astype(np.float64)
-        extent = (bounds[3:] - bounds[:3]).max() if count else 1.0
-        limits = np.finfo(np.float32)
-        scale = np.clip(2.0 / max(extent, limits.tiny), limits.tiny, limits.max)
-        frame = np.append(bounds[:3], scale).astype(np.float32)
-        self.own["frame"] = self.device.upload("frame", frame)
+        boxes = self.allocate("triangle_boxes", np.float32, 6 * triangle_count)
+        for name in ("kept", "ranks", "triangles"):
+            self.allocate(name, np.uint32, triangle_count)
+        self.run("prepare_triangles", triangle_count)
+        total = self.primitives.compact(
+            *(self.own[name] for name in ("kept", "ranks", "triangles")), triangle_count
+        )
+        count = self.scalars["count"] = int(self.device.read(total)[0])
+        self.release("kept", "ranks")
 
-    def sort_references(self) -> None:
-        """Leave in ``order`` the references along the Morton curve."""
-        count = self.scalars["count"]
-        for name in ("codes", "spare_codes"):
+        bounds = self.device.read(self.primitives.bounds(boxes, 2 * triangle_count))
+        self.own["frame"] = self.device.upload("frame", _frame(bounds))
+        for name in ("codes", "next_codes"):
             self.allocate(name, np.uint64, count)
-        for name in ("order", "spare_order"):
-            self.allocate(name, np.uint32, count)
+        self.allocate("next_triangles", np.uint32, count)
         self.run("make_codes", count)
-        names = ("codes", "order", "spare_codes", "spare_order")
+        names = ("codes", "triangles", "next_codes", "next_triangles")
         _, order = self.primitives.sort(*(self.own[name] for name in names), count, _CODE_BITS)
-        if order is self.own["spare_order"]:
-            self.own["order"], self.own["spare_order"] = order, self.own["order"]
-        self.release("codes", "spare_codes", "spare_order")
+        if order is self.own["next_triangles"]:
+            self.swap("triangles")
+        self.release("codes", "next_codes", "next_triangles")
 
     def join_clusters(self) -> None:
         """Leave the binary tree in ``tree``, its root last."""
         count = self.scalars["count"]
-        self.allocate("tree", BINARY_NODE.dtype, 2 * count)
-        for name in ("clusters", "next_clusters", "nearest", "stays"):
-            self.allocate(name, np.uint32, count)
         stride = self.scalars["stride"] = count + _MARGIN
+        self.allocate("tree", BINARY_NODE.dtype, 2 * count)
+        for name in ("clusters", "next_clusters", "nearest", "places"):
+            self.allocate(name, np.uint32, count)
         for name in ("boxes", "next_boxes"):
             self.allocate(name, np.float32, 6 * stride)
         self.run("make_leaves", count)
-        self.release("order", "frame")
-        # Scanned in place.
-        self.own["places"] = self.own["stays"]
         node_start, span = count, _NO_SPAN
         while count > 1:
-            self.scalars |= {
-                "cluster_count": count,
-                "node_start": node_start,
-                "span": span,
-            }
+            self.scalars |= {"cluster_count": count, "node_start": node_start, "span": span}
             self.run("find_nearest", count)
             self.run("mark_staying", count)
-            stays = self.own["stays"]
-            left = int(self.device.read(self.primitives.scan(stays, stays, count))[0])
+            places = self.own["places"]
+            left = int(self.device.read(self.primitives.scan(places, places, count))[0])
             self.run("join_pairs", count)
-            own = self.own
-            for name in ("clusters", "boxes"):
-                own[name], own[f"next_{name}"] = own[f"next_{name}"], own[name]
-            node_start += count - left
-            span = _SHORT_SPAN if (count - left) * _FEW < count else _NO_SPAN
+            self.swap("clusters", "boxes")
+            joined = count - left
+            node_start += joined
+            span = _SHORT_SPAN if joined * _FEW < count else _NO_SPAN
             count = left
-        del self.own["places"]
-        self.release("clusters", "next_clusters", "boxes", "next_boxes", "nearest", "stays")
+        self.release("clusters", "next_clusters", "boxes", "next_boxes", "nearest", "places")
 
-    def open_nodes(self) -> None:
-        """Find the wide nodes level by level, and where they lie in memory."""
+    def finish(self) -> Bvh:
+        """Make the wide nodes of ``tree`` and wait for them; the caller releases the result."""
+        self.release("triangle_boxes", "triangles", "frame")
+        levels = self._open_levels()
+        self._lay_out(levels)
+        node_count = self.scalars["node_count"] = max(sum(size for _, size in levels), 1)
+        block_count = int(self.device.read(self.own["blocks_below"], 1)[0])
+        self.allocate("nodes", BVH_NODE.dtype, node_count)
+        self.allocate("blocks", TRIANGLE_BLOCK.dtype, block_count)
+        self.run("link_nodes", node_count)
+        bvh = Bvh(
+            nodes=self.own["nodes"],
+            blocks=self.own["blocks"],
+            node_count=node_count,
+            block_count=block_count,
+            depth=max(len(levels), 1),
+            dropped=self.scalars["triangle_count"] - self.scalars["count"],
+            width=self.width,
+        )
+        _fit(self.program, bvh, self.own["places"], levels, self.positions)
+        self.device.wait()
+        del self.own["nodes"], self.own["blocks"]
+        return bvh
+
+    def _open_levels(self) -> list[tuple[int, int]]:
+        """Find the wide nodes level by level; return where each level starts and its size."""
         count = self.scalars["count"]
         for name in _NODE_NUMBERS:
             self.allocate(name, np.uint32, count)
-        self.allocate("children", np.uint32, WIDTH * count)
-        self.allocate("offsets", np.uint32, count)
+        self.allocate("children", np.uint32, self.width * count)
         self.device.write(self.own["wide"], np.array([max(2 * count - 2, 0)], np.uint32))
-        level_start, level_count = 0, 1 if count else 0
-        while level_count > 0:
-            self.levels.append((level_start, level_count))
-            self.run_level("open_nodes", -1)
+        levels = [(0, min(count, 1))]
+        while levels[-1][1]:
+            self._run_level("open_nodes", levels[-1])
             offsets = self.own["offsets"]
-            total = self.primitives.scan(offsets, offsets, level_count)
-            self.run_level("list_children", -1)
-            level_start += level_count
-            level_count = int(self.device.read(total)[0])
-        for level in reversed(range(len(self.levels))):
-            self.run_level("count_below", level)
-        for level in range(len(self.levels)):
-            self.run_level("place_children", level)
-        self.scalars["node_count"] = max(level_start, 1)
-        self.scalars["block_count"] = int(self.device.read(self.own["blocks_below"], 1)[0])
-        self.release("wide", "firsts", "offsets", "nodes_below", "blocks_below")
+            total = self.primitives.scan(offsets, offsets, levels[-1][1])
+            self._run_level("list_children", levels[-1])
+            levels.append((sum(levels[-1]), int(self.device.read(total)[0])))
+        return levels[:-1]
 
-    def fill_nodes(self) -> None:
-        node_count = self.scalars["node_count"]
-        self.allocate("nodes", BVH_NODE.dtype, node_count)
-        self.allocate("blocks", TRIANGLE_BLOCK.dtype, self.scalars["block_count"])
-        self.run("fill_nodes", node_count)
-        for level in reversed(range(len(self.levels) - 1)):
-            self.run_level("fit_nodes", level)
+    def _lay_out(self, levels: list[tuple[int, int]]) -> None:
+        """Find where in memory each wide node and its blocks go."""
+        for level in reversed(levels):
+            self._run_level("count_below", level)
+        for level in levels:
+            self._run_level("place_children", level)
 
-    def run_level(self, kernel: str, level: int) -> None:
-        start, count = self.levels[level]
-        self.scalars |= {"level_start": start, "level_count": count}
-        self.run(kernel, count)
+    def _run_level(self, kernel: str, level: tuple[int, int]) -> None:
+        self.scalars |= {"level_start": level[0], "level_count": level[1]}
+        self.run(kernel, level[1])
+
+
+def _frame(bounds: np.ndarray) -> np.ndarray:
+    """Return low x, y, z and 2 / the largest extent, float32, of finite bounds or of nothing's."""
+    low, high = bounds.reshape(2, 3).astype(np.float64)
+    if not (low <= high).all():
+        return np.array([0, 0, 0, 1], np.float32)
+    limits = np.finfo(np.float32)
+    scale = 2.0 / max((high - low).max(), float(limits.tiny))
+    return np.append(low, np.clip(scale, limits.tiny, limits.max)).astype(np.float32)

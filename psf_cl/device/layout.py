@@ -111,12 +111,12 @@ BINARY_NODE = Record(
     "BinaryNode",
     "A node of the binary tree that the wide nodes are made from; one cache line.",
     _fields("""
-    float low[3] - of its box, in the unit of the scene's size
-    uint left - child; of a leaf its reference
+    float low[3] - of its box; the scene's largest extent is 1
+    uint left - child; of a leaf its triangle
     float high[3] - of its box
     uint right - child; of a leaf LEAF_BIT
     float costs[7] - least cost of the subtree as at most 1 .. 7 children of a wide node
-    uint size - references below; LEAF_BIT set if they are best kept as one block
+    uint size - triangles below; LEAF_BIT set if they are best kept as one block
     """),
 )
 
