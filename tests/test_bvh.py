@@ -446,9 +446,9 @@ def test_equal_triangles_make_a_shallow_tree(traced):
 
 def test_nested_triangles_make_a_tree_of_bounded_depth(traced):
     # Of one centre, in the order of their sizes: every box is nearest to the one before it, so that
-    # only the first two choose each other.
-    count = 3000
-    sizes = 1 + np.arange(count) / 1000
+    # only the first two choose each other.  Powers of two: centres must not move by rounding.
+    count = 4096
+    sizes = (1 + np.arange(count)) / count
     corners = np.array([[-1, -1, -1], [1, 1, 1], [1, -1, 1]])
     tree = traced(sizes[:, None, None] * corners)
     check_tree(tree)
