@@ -1,7 +1,9 @@
 // Rays through a tree, timed or counted.  COUNTED: the traversal's box and triangle tests each add 1
 // to a word, through the parameter that cut-outs would have.
 
+#define FEW 0
 #include "../cl/common/geometry.h"
+#include "../cl/common/lanes.h"
 
 #if COUNTED
 #define ALPHA_PARAMETERS , uint *visits
@@ -12,17 +14,24 @@
 
 #include "../cl/common/traverse.h"
 
-static inline Ray load_ray(global const float *rays, uint i)
+/// Set up rays `first` to `first + W - 1`; those that are not there have a t_max of 0.
+static inline void load_rays(
+    RaySetups *setups, global const float *rays, uint first, uint ray_count)
 {
-    Ray ray;
-    for (uint axis = 0; axis < 3; ++axis) {
-        ray.origin[axis] = rays[7 * (size_t)i + axis];
-        ray.direction[axis] = rays[7 * (size_t)i + 3 + axis];
+    float fields[7][W];
+    for (uint k = 0; k < W; ++k) {
+        for (uint c = 0; c < 7; ++c)
+            fields[c][k] = first + k < ray_count ? rays[7 * (size_t)(first + k) + c] : 0.0f;
     }
-    ray.t_max = rays[7 * (size_t)i + 6];
-    return ray;
+    const Vec3 origin =
+        vec3(load_lanes(fields[0]), load_lanes(fields[1]), load_lanes(fields[2]));
+    const Vec3 direction =
+        vec3(load_lanes(fields[3]), load_lanes(fields[4]), load_lanes(fields[5]));
+    set_up_rays(setups, MASK_ALL, origin, direction, load_lanes(fields[6]));
 }
 
+/// W rays a work item.
+///
 /// reads   rays[7 * i + (0..6)]: origin, direction, t_max
 /// writes  triangles[i], NO_HIT for none; distances[i]; counts[2 * i + (0, 1)], nodes and blocks
 kernel void trace_closest_rays(
@@ -34,15 +43,21 @@ kernel void trace_closest_rays(
     global uint *counts,
     const uint ray_count)
 {
-    const uint i = get_global_id(0);
-    if (i >= ray_count)
+    const uint first = get_global_id(0) * W;
+    if (first >= ray_count)
         return;
-    uint visits[2] = {0, 0};
-    const Hit hit = trace_closest(nodes, blocks, load_ray(rays, i) ALPHA_ARGUMENTS);
-    triangles[i] = hit.triangle;
-    distances[i] = hit.t;
-    counts[2 * (size_t)i] = visits[0];
-    counts[2 * (size_t)i + 1] = visits[1];
+    RaySetups setups;
+    load_rays(&setups, rays, first, ray_count);
+    for (uint k = 0; k < W && first + k < ray_count; ++k) {
+        const RaySetup ray = ray_setup(&setups, k);
+        uint visits[2] = {0, 0};
+        const Hit hit = trace_closest(nodes, blocks, &ray ALPHA_ARGUMENTS);
+        const size_t i = first + k;
+        triangles[i] = hit.triangle;
+        distances[i] = hit.t;
+        counts[2 * i] = visits[0];
+        counts[2 * i + 1] = visits[1];
+    }
 }
 
 /// reads   rays, as above
@@ -55,11 +70,17 @@ kernel void trace_any_rays(
     global uint *counts,
     const uint ray_count)
 {
-    const uint i = get_global_id(0);
-    if (i >= ray_count)
+    const uint first = get_global_id(0) * W;
+    if (first >= ray_count)
         return;
-    uint visits[2] = {0, 0};
-    triangles[i] = trace_any(nodes, blocks, load_ray(rays, i) ALPHA_ARGUMENTS) ? 0 : NO_HIT;
-    counts[2 * (size_t)i] = visits[0];
-    counts[2 * (size_t)i + 1] = visits[1];
+    RaySetups setups;
+    load_rays(&setups, rays, first, ray_count);
+    for (uint k = 0; k < W && first + k < ray_count; ++k) {
+        const RaySetup ray = ray_setup(&setups, k);
+        uint visits[2] = {0, 0};
+        const size_t i = first + k;
+        triangles[i] = trace_any(nodes, blocks, &ray ALPHA_ARGUMENTS) ? 0 : NO_HIT;
+        counts[2 * i] = visits[0];
+        counts[2 * i + 1] = visits[1];
+    }
 }
