@@ -325,15 +325,14 @@ def read_baseline(path: Path, conditions: Mapping[str, Any]) -> dict[str, Typica
         if found != value:
             raise InputError(f"{path}: {name}: expected {value!r}, as now; got {found!r}")
     figures = content.get("ns_per_sample")
-    try:
-        return {
-            str(name): Typical(float(value["median"]), float(value["spread"]))
-            for name, value in figures.items()
-        }
-    except (AttributeError, TypeError, ValueError, KeyError, OverflowError):
-        raise InputError(
-            f"{path}: ns_per_sample: expected a median and a spread for each name"
-        ) from None
+    found = {}
+    for name, value in figures.items() if isinstance(figures, dict) else [("", figures)]:
+        pair = (value.get("median"), value.get("spread")) if isinstance(value, dict) else ()
+        # Comparing is exact for integers of any length; no infinity or NaN is in the range.
+        if not pair or not all(type(x) in (int, float) and 0 <= x < 1e30 for x in pair):
+            raise InputError(f"{path}: ns_per_sample: expected a median and a spread for each name")
+        found[name] = Typical(*pair)
+    return found
 
 
 def changes(before: Mapping[str, Typical], repetitions: Sequence[Repetition]) -> list[Change]:
