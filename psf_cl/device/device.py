@@ -177,9 +177,12 @@ class Device:
 
     def note_event(self, stage: str, name: str, items: int, event: cl.Event) -> None:
         """Keep the event of a command (profiling only); the arguments are those of ``Interval``."""
-        if self.profiling:
-            # Events of copies hold on to the host's array: a second handle of the event does not.
-            self.events.append((stage, name, items, cl.Event.from_int_ptr(event.int_ptr)))
+        if not self.profiling:
+            return
+        if isinstance(event, cl.NannyEvent):
+            # It holds on to the host's array, which a second handle of the event does not.
+            event = cl.Event.from_int_ptr(event.int_ptr)
+        self.events.append((stage, name, items, event))
 
     def collect_events(self) -> None:
         """Add the commands so far to ``totals`` and report them; call after everything is done."""
