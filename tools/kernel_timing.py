@@ -302,13 +302,15 @@ def _change_table(changes: Sequence[timing.Change], path: str) -> Table:
 
 def _full_table(own: Stopwatch, full: Stopwatch) -> Table:
     """Return the scene's own build beside the full one, kernel by kernel."""
-    forced = [
-        name
-        for name, feature in full.renderer.plan.features.items()
-        if feature.value != own.renderer.plan.features[name].value
-    ]
-    title = f"What leaving out gains, ns a sample; on in the full build only: {', '.join(forced)}"
-    table = _table(title, ["what"], ["own build", "full build", "full / own", "noise"])
+    features = full.renderer.plan.features
+    own_features = own.renderer.plan.features
+    more = [name for name in features if features[name].value > own_features[name].value]
+    less = [name for name in features if features[name].value < own_features[name].value]
+    headings = ["own build", "full build", "full / own", "noise"]
+    table = _table("What leaving out gains, ns a sample", ["what"], headings)
+    table.caption = f"only the full build has {', '.join(more) or 'nothing'}"
+    table.caption += f"; only the own build has {', '.join(less)}" if less else ""
+    table.caption_justify = "left"
     before = {
         name: Typical(value["median"], value["spread"])
         for name, value in timing.baseline({}, own.repetitions)["ns_per_sample"].items()
