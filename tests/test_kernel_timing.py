@@ -178,14 +178,28 @@ def test_a_change_counts_beyond_the_spreads_of_both():
 def test_a_baseline_comes_back_and_tells_what_changed(tmp_path):
     path = tmp_path / "baseline.json"
     calm = [repetition(kernels=[(spent, 64)]) for spent in (0.050, 0.051, 0.052)]
-    path.write_text(json.dumps(timing.baseline(CONDITIONS, calm)))
+    now = timing.ns_by_name(calm)
+    path.write_text(json.dumps(timing.baseline(CONDITIONS, [now])))
     before = timing.read_baseline(path, CONDITIONS)
-    assert not any(change.beyond_noise for change in timing.changes(before, calm))
+    assert before == now
+    assert not any(change.beyond_noise for change in timing.changes(before, now))
     faster = [repetition(kernels=[(spent, 64)]) for spent in (0.020, 0.021, 0.022)]
-    verdicts = {c.name: c.beyond_noise for c in timing.changes(before, faster)}
-    assert verdicts == {"whole": False, "trace: trace_rays": True}
-    gone = timing.changes(before | {"sort: sort_paths": Typical(1.0, 0.0)}, calm)[-1]
+    changes = timing.changes(before, timing.ns_by_name(faster))
+    assert [change.name for change in changes] == ["whole", "trace: trace_rays"]
+    assert [change.beyond_noise for change in changes] == [False, True]
+    gone = timing.changes(before | {"sort: sort_paths": [1.0]}, now)[-1]
     assert gone.name == "sort: sort_paths" and gone.now is None
+
+
+def test_what_differs_between_the_runs_of_a_baseline_is_noise():
+    slow, fast = (
+        timing.ns_by_name([repetition(kernels=[(spent, 64)]) for spent in times])
+        for times in ((0.050, 0.051, 0.052), (0.020, 0.021, 0.022))
+    )
+    both = timing.baseline(CONDITIONS, [slow, fast])["ns_per_sample"]
+    assert both["trace: trace_rays"] == slow["trace: trace_rays"] + fast["trace: trace_rays"]
+    assert timing.changes(slow, fast)[1].beyond_noise
+    assert not timing.changes(both, fast)[1].beyond_noise
 
 
 @pytest.mark.parametrize(
@@ -198,12 +212,15 @@ def test_a_baseline_comes_back_and_tells_what_changed(tmp_path):
         ('{"format": 1}', "scene: expected 'box.toml', as now; got None"),
         ('{"format": 1, "conditions": 3}', "scene: expected"),
         ('{"format": 1, "conditions": {"scene": "box.toml", "size": [9, 8]}}', "size: expected"),
-        (None, "ns_per_sample: expected a median"),
-        ([], "ns_per_sample: expected a median"),
-        ({"k": {"median": 1}}, "ns_per_sample: expected a median"),
-        ({"k": {"median": "x", "spread": 1}}, "ns_per_sample: expected a median"),
-        ({"k": {"median": float("nan"), "spread": 1}}, "ns_per_sample: expected a median"),
-        ({"k": {"median": 1, "spread": -1}}, "ns_per_sample: expected a median"),
+        (None, "ns_per_sample: expected a list of numbers"),
+        ([1.0], "ns_per_sample: expected a list of numbers"),
+        ({"k": []}, "ns_per_sample: expected a list of numbers"),
+        ({"k": 1.0}, "ns_per_sample: expected a list of numbers"),
+        ({"k": [1.0, "x"]}, "ns_per_sample: expected a list of numbers"),
+        ({"k": [True]}, "ns_per_sample: expected a list of numbers"),
+        ({"k": [float("nan")]}, "ns_per_sample: expected a list of numbers"),
+        ({"k": [-1.0]}, "ns_per_sample: expected a list of numbers"),
+        ({"k": [10**400]}, "ns_per_sample: expected a list of numbers"),
     ],
 )
 def test_a_bad_baseline_is_refused_in_one_line(tmp_path, text, message):
@@ -374,6 +391,9 @@ def test_the_tool_shows_kernels_saves_and_compares(device, tool, tmp_path, capsy
     assert "accesses" not in text
     assert re.search(r"^next: \w+, \d+% of the time", text, re.MULTILINE)
     assert check_trace(json.loads(Path(trace).read_text())) > 0
+    assert tool.main([*common, "--add", baseline]) in (0, 1)
+    capsys.readouterr()
+    assert len(json.loads(Path(baseline).read_text())["ns_per_sample"]["whole"]) == 6
     assert tool.main([*common, "--baseline", baseline, "--full"]) in (0, 1)
     text = capsys.readouterr().out
     assert re.search(r"^whole .*(within noise|FASTER|SLOWER)", text, re.MULTILINE)

@@ -6,8 +6,10 @@ figures are medians over them.  The time of a repetition falls into kernels, tra
 time in which the kernel ran.  Bytes are those that a kernel declares for an item that does all it
 can, without tree nodes and texels; beside them is what the device copies, as a measure.
 
-``--save`` keeps the medians and their spread (the distance between the quartiles), ``--baseline``
-compares with what was kept: beyond noise is what differs by more than both spreads together.
+``--save`` keeps the times of the repetitions, ``--baseline`` compares with what was kept: beyond
+noise is what differs by more than both spreads (the distances between the quartiles) together.
+Machines are faster and slower for minutes: ``--add`` adds a run to a baseline, and what differed
+between its runs is noise from then on.
 ``--full`` renders also with every feature compiled in, in turns, to show what leaving out gains.
 ``--trace`` writes the last repetition for https://ui.perfetto.dev or chrome://tracing.
 """
@@ -115,6 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--warm-up", metavar="S", type=positive_number, default=1.0, help="(1.0)")
     parser.add_argument("--save", metavar="FILE.json", type=file_argument, help="keep a baseline")
+    parser.add_argument("--add", metavar="FILE.json", type=file_argument, help="to a baseline")
     parser.add_argument("--baseline", metavar="FILE.json", type=file_argument, help="compare")
     parser.add_argument("--trace", metavar="FILE.json", type=file_argument, help="write a trace")
     parser.add_argument("--full", action="store_true", help="compare with every feature built in")
@@ -122,7 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     if args.repetitions < 3:
         parser.error("--repetitions: expected at least 3: the spread shows between them")
-    outputs = [path for path in (args.save, args.trace) if path]
+    outputs = [path for path in (args.save, args.add, args.trace) if path]
     for path in outputs:
         check_writable(path)
 
@@ -131,7 +134,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     tell_notes(scene.notes)
     device = open_device(args.device, profiling=True)
     conditions = _conditions(args, scene, settings, device)
-    before = timing.read_baseline(Path(args.baseline), conditions) if args.baseline else None
+    before, added_to = (
+        timing.read_baseline(Path(path), conditions) if path else {}
+        for path in (args.baseline, args.add)
+    )
 
     own = Stopwatch(_renderer(args, scene, settings, device), keep_intervals=bool(args.trace))
     watches = [own]
@@ -144,13 +150,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             watch.repeat(args.seconds)
 
     _show_measured(own, device, args)
-    if before is not None:
-        show(Text(), _change_table(timing.changes(before, own.repetitions), args.baseline))
+    measured = timing.ns_by_name(own.repetitions)
+    if args.baseline:
+        show(Text(), _change_table(timing.changes(before, measured), args.baseline))
     if args.full:
         show(Text(), _full_table(own, watches[1]))
-    if args.save:
-        kept = timing.baseline(conditions, own.repetitions)
-        write_whole(args.save, (json_text(kept, indent=2) + "\n").encode())
+    for path, runs in ((args.save, [measured]), (args.add, [added_to, measured])):
+        if path:
+            kept = timing.baseline(conditions, runs)
+            write_whole(path, (json_text(kept, indent=2) + "\n").encode())
     if args.trace:
         trace = timing.chrome_trace(own.intervals, device.name)
         write_whole(args.trace, json_text(trace).encode())
@@ -311,11 +319,8 @@ def _full_table(own: Stopwatch, full: Stopwatch) -> Table:
     table.caption = f"only the full build has {', '.join(more) or 'nothing'}"
     table.caption += f"; only the own build has {', '.join(less)}" if less else ""
     table.caption_justify = "left"
-    before = {
-        name: Typical(value["median"], value["spread"])
-        for name, value in timing.baseline({}, own.repetitions)["ns_per_sample"].items()
-    }
-    for change in timing.changes(before, full.repetitions):
+    times = [timing.ns_by_name(watch.repetitions) for watch in (own, full)]
+    for change in timing.changes(*times):
         now, was = change.now, change.before
         ratio = f"{now.median / was.median:.2f}" if now and was and was.median > 0.0 else ""
         noise = f"{change.noise:.2f}"

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from psf_cl.errors import InputError
+from psf_cl.errors import InputError, shown
 from psf_cl.files import read_file
 
 #: Stage of the commands that only move or set memory.
@@ -282,33 +282,45 @@ class Change:
         return abs(self.now.median - self.before.median) > self.noise
 
 
-def baseline(conditions: Mapping[str, Any], repetitions: Sequence[Repetition]) -> dict[str, Any]:
+def ns_by_name(repetitions: Sequence[Repetition]) -> dict[str, list[float]]:
+    """Return ns a sample of each repetition: of the whole, then of each command, longest first."""
+
+    def of_samples(seconds: Sequence[float]) -> list[float]:
+        pairs = zip(seconds, repetitions, strict=True)
+        return [part / _NS / max(whole.samples, 1) for part, whole in pairs]
+
+    keys = [(figures.stage, figures.name) for figures in kernel_figures(repetitions, {})]
+    tallies = [repetition.tally.by_command for repetition in repetitions]
+    return {"whole": of_samples([repetition.seconds for repetition in repetitions])} | {
+        f"{stage}: {name}": of_samples(
+            [tally.get((stage, name), Spent()).seconds for tally in tallies]
+        )
+        for stage, name in keys
+    }
+
+
+def baseline(
+    conditions: Mapping[str, Any], runs: Sequence[Mapping[str, Sequence[float]]]
+) -> dict[str, Any]:
     """Return what ``read_baseline`` takes, as JSON values.
 
     Args:
         conditions: all that has to be the same for a comparison to mean something.
+        runs: of ``ns_by_name`` or ``read_baseline``; their repetitions are joined, so that what
+            changes from run to run is part of the spread.
     """
+    names = {name: None for run in runs for name in run}
     return {
         "format": _BASELINE_FORMAT,
         "conditions": dict(conditions),
-        "repetitions": len(repetitions),
         "ns_per_sample": {
-            name: {"median": value.median, "spread": value.spread}
-            for name, value in _compared(repetitions).items()
+            name: [value for run in runs for value in run.get(name, ())] for name in names
         },
     }
 
 
-def _compared(repetitions: Sequence[Repetition]) -> dict[str, Typical]:
-    """Return the figures that are compared: the whole, and each kernel and kind of transfer."""
-    figures = kernel_figures(repetitions, {})
-    return {"whole": ns_per_sample(repetitions)} | {
-        f"{figure.stage}: {figure.name}": figure.ns_per_sample for figure in figures
-    }
-
-
-def read_baseline(path: Path, conditions: Mapping[str, Any]) -> dict[str, Typical]:
-    """Return the figures of a baseline by name.
+def read_baseline(path: Path, conditions: Mapping[str, Any]) -> dict[str, list[float]]:
+    """Return ns a sample of each repetition of a baseline, by name.
 
     Raises:
         InputError: it is no baseline, or one of other conditions.
@@ -323,20 +335,29 @@ def read_baseline(path: Path, conditions: Mapping[str, Any]) -> dict[str, Typica
     for name, value in conditions.items():
         found = measured.get(name) if isinstance(measured, dict) else None
         if found != value:
-            raise InputError(f"{path}: {name}: expected {value!r}, as now; got {found!r}")
-    figures = content.get("ns_per_sample")
-    found = {}
-    for name, value in figures.items() if isinstance(figures, dict) else [("", figures)]:
-        pair = (value.get("median"), value.get("spread")) if isinstance(value, dict) else ()
-        # Comparing is exact for integers of any length; no infinity or NaN is in the range.
-        if not pair or not all(type(x) in (int, float) and 0 <= x < 1e30 for x in pair):
-            raise InputError(f"{path}: ns_per_sample: expected a median and a spread for each name")
-        found[name] = Typical(*pair)
-    return found
+            raise InputError(f"{path}: {name}: expected {value!r}, as now; got {shown(found)}")
+    values = content.get("ns_per_sample")
+    if not isinstance(values, dict) or not all(_are_times(times) for times in values.values()):
+        raise InputError(f"{path}: ns_per_sample: expected a list of numbers for each name")
+    return values
 
 
-def changes(before: Mapping[str, Typical], repetitions: Sequence[Repetition]) -> list[Change]:
-    """Compare repetitions with a baseline, name by name, in the order of the time they take."""
-    now = _compared(repetitions)
+def _are_times(values: Any) -> bool:
+    # Comparing is exact for integers of any length; no infinity or NaN is in the range.
+    return (
+        isinstance(values, list)
+        and len(values) > 0
+        and all(type(value) in (int, float) and 0 <= value < 1e30 for value in values)
+    )
+
+
+def changes(
+    before: Mapping[str, Sequence[float]], now: Mapping[str, Sequence[float]]
+) -> list[Change]:
+    """Compare two runs of ``ns_by_name`` name by name, in the order of the second."""
+
+    def typical(values: Sequence[float] | None) -> Typical | None:
+        return None if values is None else Typical.of(values)
+
     names = [*now, *(name for name in before if name not in now)]
-    return [Change(name, before.get(name), now.get(name)) for name in names]
+    return [Change(name, typical(before.get(name)), typical(now.get(name))) for name in names]
