@@ -4,12 +4,13 @@ After a warm-up the render is measured in repetitions, with the pool of paths al
 figures are medians over them.  The time of a repetition falls into kernels, transfers, launching
 (something is queued but nothing runs) and the host's part (nothing is queued).  Rates are of the
 time in which the kernel ran.  Bytes are those that a kernel declares for an item that does all it
-can, without tree nodes and texels; beside them is what the device copies, as a measure.
+can, without tree nodes and texels, from memory or from caches; beside them is the bandwidth at
+which the device copies a large buffer, as a measure.
 
 ``--save`` keeps the times of the repetitions, ``--baseline`` compares with what was kept: beyond
 noise is what differs by more than both spreads (the distances between the quartiles) together.
 Machines are faster and slower for minutes: ``--add`` adds a run to a baseline, and what differed
-between its runs is noise from then on.
+between its runs is noise from then on; a change that all kernels have in common is told.
 ``--full`` renders also with every feature compiled in, in turns, to show what leaving out gains.
 ``--trace`` writes the last repetition for https://ui.perfetto.dev or chrome://tracing.
 """
@@ -19,7 +20,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -152,7 +153,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _show_measured(own, device, args)
     measured = timing.ns_by_name(own.repetitions)
     if args.baseline:
-        show(Text(), _change_table(timing.changes(before, measured), args.baseline))
+        stages = {stage.name for stage in own.renderer.plan.stages}
+        show(Text(), _change_table(timing.changes(before, measured), args.baseline, stages))
     if args.full:
         show(Text(), _full_table(own, watches[1]))
     for path, runs in ((args.save, [measured]), (args.add, [added_to, measured])):
@@ -290,9 +292,10 @@ def _next_step(figures: Sequence[KernelFigures]) -> str:
     )
 
 
-def _change_table(changes: Sequence[timing.Change], path: str) -> Table:
+def _change_table(changes: Sequence[timing.Change], path: str, stages: Collection[str]) -> Table:
     headings = ["before", "now", "change", "noise", ""]
     table = _table(f"Against {path}, ns a sample", ["what"], headings)
+    ratios: list[float] = []
     for change in changes:
         before, now = change.before, change.now
         cells = [change.name, _nanoseconds(before), _nanoseconds(now)]
@@ -300,11 +303,17 @@ def _change_table(changes: Sequence[timing.Change], path: str) -> Table:
             table.add_row(*cells, "", "", "new" if before is None else "gone")
             continue
         ratio = f"{now.median / before.median - 1.0:+.1%}" if before.median > 0.0 else ""
+        if before.median > 0.0 and change.name.partition(":")[0] in stages:
+            ratios.append(now.median / before.median)
         verdict = Text("within noise", style="dim")
         if change.beyond_noise:
             faster = now.median < before.median
             verdict = Text(*(("FASTER", "green") if faster else ("SLOWER", "red")))
         table.add_row(*cells, ratio, f"{change.noise:.2f}", verdict)
+    if ratios:
+        common = Typical.of(ratios).median - 1.0
+        table.caption = f"median change of the kernels: {common:+.1%}; the machine's part is in it"
+        table.caption_justify = "left"
     return table
 
 
