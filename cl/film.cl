@@ -65,6 +65,37 @@ kernel void add_samples(
     }
 }
 
+/// Whether a pass belongs to the second half of the samples.
+///
+/// Halves have to differ as independent renders would.  Every other Sobol' point would not do: these
+/// are opposites in the first dimension.  Runs of about sqrt(pass) points have each half the pattern
+/// of a whole sequence; the halves are equal whenever the number of passes is a power of two.
+inline int pass_is_in_half(uint pass)
+{
+    return (pass >> ((31u - clz(pass | 1u)) >> 1)) & 1u;
+}
+
+/// Add every complete pass of the second half.  One work item a pixel, before advance_film.
+///
+/// reads   samples, counters
+/// writes  film_half
+kernel void add_half(
+    __global const Params *params,
+    __global const float *samples,
+    const volatile __global uint *counters,
+    __global FilmSum *film_half)
+{
+    const uint pixel = get_global_id(0);
+    if (pixel >= params->pixel_count)
+        return;
+    for (uint k = 0; pass_is_complete(params, counters, k); ++k) {
+        const uint pass = counters[COUNTER_FILM_PASS] + k;
+        const ulong at = (ulong)(pass & (params->ring - 1u)) * params->pixel_count + pixel;
+        if (pass_is_in_half(pass))
+            add_sample(&film_half[pixel], vload4(at, samples));
+    }
+}
+
 /// Let the window move past the passes that add_samples has added.  One work item.
 ///
 /// reads, writes  counters

@@ -111,6 +111,7 @@ def make_plan(
     crop: tuple[int, int, int, int] | None = None,
     statistics: bool = False,
     full: bool = False,
+    halves: bool = False,
 ) -> Plan:
     """Derive what a render needs; works without OpenCL.
 
@@ -121,6 +122,7 @@ def make_plan(
         statistics: whether the paths of the pool are to be counted by depth.
         full: turn every feature on, with tables of nothing where the scene has none; the image
             stays the same, what it costs shows what leaving out gains.
+        halves: whether half of the passes is to be summed apart, to estimate the error.
 
     Raises:
         InputError: an unknown AOV, or a crop outside the film.
@@ -160,6 +162,7 @@ def make_plan(
         pixel_count,
         _ring(pixel_count, traits, features),
         statistics=statistics,
+        halves=halves,
         triangle_count=triangles,
         corner_count=corners,
         material_count=len(scene.materials),

@@ -20,6 +20,7 @@ from psf_cl.device.device import Buffer, Device, open_device
 from psf_cl.device.program import Launch, Program, load_program
 from psf_cl.errors import DeviceError, InputError
 from psf_cl.image import Image
+from psf_cl.measure.errors import error_of_halves
 from psf_cl.plan import Plan, make_plan
 from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Scene, is_cut_out
@@ -31,6 +32,10 @@ from psf_cl.stages import film
 #: CPU cores; the first look, which is left out, is at a pool that is still empty.
 LOOKS_PER_CENSUS = 8
 
+#: Passes before the error is estimated for the first time, and the ratio from then on.
+FIRST_ESTIMATE = 16
+ESTIMATE_STEP = 1.25
+
 
 class Renderer:
     """One scene on one device, rendered pass by pass.
@@ -38,6 +43,7 @@ class Renderer:
     Args:
         outputs: AOVs to deliver besides the image (``psf_cl.plan.AOVS``).
         statistics: whether to measure stages (if ``device`` profiles) and occupancy for ``stats``.
+        halves: whether to sum half of the passes apart, which ``estimated_error`` needs.
         crop: (x, y, width, height) in pixels, or None for the whole film.
         full: build with every feature, to measure what leaving them out gains.
 
@@ -55,6 +61,7 @@ class Renderer:
         crop: tuple[int, int, int, int] | None = None,
         statistics: bool = False,
         full: bool = False,
+        halves: bool = False,
     ) -> None:
         self.scene = scene
         self.settings = settings or resolve(scene.render, scene.path)
@@ -62,7 +69,7 @@ class Renderer:
             raise InputError(f"{scene.path}: no camera")
         self.device = device or open_device(profiling=statistics)
         self.plan: Plan = make_plan(
-            scene, self.settings, outputs, self.device.traits, crop, statistics, full
+            scene, self.settings, outputs, self.device.traits, crop, statistics, full, halves
         )
         self.compile_seconds = 0.0
         self.statistics = statistics
@@ -116,6 +123,8 @@ class Renderer:
     def _film(self) -> None:
         for launch, planes in self.film_launches:
             launch(planes * self.plan.pixel_count, film.GROUP)
+        if self.half is not None:
+            self.half(self.plan.pixel_count, film.GROUP)
         self.advance(1)
 
     def _counters(self) -> np.ndarray:
@@ -155,6 +164,53 @@ class Renderer:
         """
         check_budget(spp, seconds)
         return self.scheduler.run(spp, seconds, progress)
+
+    def render_to(
+        self, noise: float, progress: Callable[[Progress], bool | None] | None = None
+    ) -> bool:
+        """Add passes until ``estimated_error`` is at most ``noise``; as ``render`` otherwise.
+
+        The error is looked at after 16 passes, and then whenever there are a quarter more.
+
+        Raises:
+            InputError: ``noise`` is not a positive number.
+        """
+        if not (math.isfinite(noise) and noise > 0.0):
+            raise InputError(f"noise: expected a positive number, got {noise!r}")
+        due, reached = FIRST_ESTIMATE, False
+
+        def follow(now: Progress) -> bool | None:
+            nonlocal due, reached
+            if progress is not None and progress(now) is False:
+                return False
+            if now.passes >= due:
+                with self.outside_time():
+                    reached = self.estimated_error() <= noise
+                due = math.ceil(now.passes * ESTIMATE_STEP)
+            return not reached
+
+        self.scheduler.run(None, None, follow)
+        return reached
+
+    def estimated_error(self) -> float:
+        """Return the relMSE of the image, estimated from the image alone; infinite at the start.
+
+        Only noise shows, not bias.  Sobol' points are better than the estimate knows, so that it
+        tends to be too high.
+        """
+        both, half = (self.device.read(self.buffers[name]) for name in ("film", "film_half"))
+        _, _, width, height = self.plan.crop
+        sums = [(part["sum"] - part["lost"]).astype(np.float64) for part in (both, half)]
+        counts = [part["count"].astype(np.float64)[:, None] for part in (both, half)]
+        halves = []
+        for total, count in ((sums[0] - sums[1], counts[0] - counts[1]), (sums[1], counts[1])):
+            if not count.all():
+                return math.inf
+            image = np.zeros_like(total)
+            image[self.order] = total / count
+            halves.append(image.reshape(height, width, 3))
+        share = float((counts[1] / counts[0]).mean())
+        return error_of_halves(*halves, share)
 
     @contextlib.contextmanager
     def outside_time(self) -> Iterator[None]:
@@ -416,6 +472,11 @@ class Renderer:
             for ring, name, planes in film.PLANES
             if name in self.buffers
         ]
+        self.half = (
+            self.film_program.bind_planned("add_half", self.buffers)
+            if "film_half" in self.buffers
+            else None
+        )
         self.advance = self.film_program.bind_planned("advance_film", self.buffers)
         if self.statistics:
             self.census = self.film_program.bind(

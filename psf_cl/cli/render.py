@@ -58,6 +58,12 @@ def add_parser(commands: Any) -> None:
     budget.add_argument(
         "--seconds", metavar="S", type=positive_number, help="stop after the pass that ends then"
     )
+    budget.add_argument(
+        "--noise",
+        metavar="E",
+        type=positive_number,
+        help="stop when the relMSE, estimated from the samples, is below E",
+    )
     parser.add_argument(
         "--exposure",
         metavar="EV",
@@ -112,7 +118,13 @@ def run(args: argparse.Namespace) -> int:
     if not args.quiet:
         tell_notes(scene.notes)
     renderer = Renderer(
-        scene, settings, device, outputs=args.aov, crop=args.crop, statistics=statistics
+        scene,
+        settings,
+        device,
+        outputs=args.aov,
+        crop=args.crop,
+        statistics=statistics,
+        halves=args.noise is not None,
     )
     if not args.quiet:
         tell_notes(renderer.notes)
@@ -127,10 +139,15 @@ def run(args: argparse.Namespace) -> int:
                     curve.follow(renderer, progress)
                     return not interrupted()
 
-                spp = None if args.seconds else args.spp or DEFAULT_SPP
-                renderer.render(spp=spp, seconds=args.seconds, progress=on_progress)
+                if args.noise:
+                    renderer.render_to(args.noise, on_progress)
+                else:
+                    spp = None if args.seconds else args.spp or DEFAULT_SPP
+                    renderer.render(spp=spp, seconds=args.seconds, progress=on_progress)
             image = renderer.image()
             stats = image.stats
+            if args.noise:
+                stats["estimated_relmse"] = renderer.estimated_error()
             if not stats["spp"] and not renderer.snapshot(("rgb", "samples")).aovs["samples"].any():
                 raise KeyboardInterrupt
         if reference is not None:
@@ -241,6 +258,8 @@ def _summary(path: Path, image: Image) -> str:
     rate = samples / seconds / 1e6 if seconds > 0.0 else math.inf
     count = f"{spp} spp" if spp else "part of the first pass"
     text = f"{path}: {count} in {seconds:.2f} s, {rate:.2f} Msamples/s"
+    if "estimated_relmse" in stats:
+        text += f", estimated relMSE {stats['estimated_relmse']:.4g}"
     if stats.get("error"):
         last = stats["error"][-1]
         text += f", relMSE {last['relmse']:.4g}, trimmed {last['relmse_trimmed']:.4g}"

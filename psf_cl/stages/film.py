@@ -37,6 +37,13 @@ def plan(context: Context) -> StageSpec:
         KernelSpec("add_samples", record_bytes=sample_bytes, per_sample=True, lanes=False),
         KernelSpec("advance_film", lanes=False),
     ]
+    if context.halves:
+        half_bytes = 16 + dtype.itemsize  # Half of the samples are added.
+        kernels.append(
+            KernelSpec("add_half", record_bytes=half_bytes, per_sample=True, lanes=False)
+        )
+        what = "sums of half of the passes, to estimate the error"
+        buffers.append(BufferSpec("film_half", dtype, context.pixel_count, what))
     if context.statistics:
         kernels.append(KernelSpec("count_depths", reads=("status",), record_bytes=8, lanes=False))
         buffers.append(BufferSpec("census", np.dtype(np.uint32), CENSUS_BINS, "paths by depth"))

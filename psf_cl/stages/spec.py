@@ -115,6 +115,7 @@ class Context:
     material_count: int = 0
     texture_count: int = 0
     statistics: bool = False
+    halves: bool = False
 
     def on(self, name: str) -> bool:
         return bool(self.features[name].value)
