@@ -44,7 +44,14 @@ class FakeRenderer:
     started = 1.0
 
     def __init__(
-        self, scene, settings, device=None, outputs=frozenset(), crop=None, statistics=False
+        self,
+        scene,
+        settings,
+        device=None,
+        outputs=frozenset(),
+        crop=None,
+        statistics=False,
+        halves=False,
     ):
         type(self).made = {"settings": settings, "outputs": outputs, "crop": crop, "device": device}
         if self.build_error is not None:
@@ -214,7 +221,6 @@ BAD_USAGE = {
     "render a.toml --seconds nan": "--seconds",
     "render a.toml --seconds inf": "--seconds",
     "render a.toml --spp 4 --seconds 2": "not allowed with",
-    "render a.toml --noise 0.1": "--noise",
     "render a.toml --size 0x5": "--size",
     "render a.toml --size 5": "--size",
     "render a.toml --crop 0,0,5": "--crop",
