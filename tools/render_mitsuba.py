@@ -4,7 +4,7 @@
         tools/render_mitsuba.py {scene} {out} --seconds {seconds} --seed {seed} \
         --size {width}x{height} --stats {stats}"
 
-What it needs: see ``tools/compare_mitsuba.py``.  Passes of 1, 1, 2,
+What it needs and which materials it knows: see ``tools/compare_mitsuba.py``.  Passes of 1, 1, 2,
 4, ... samples a pixel are averaged until the next one would go beyond the time.
 """
 
@@ -18,6 +18,7 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+from compare_mitsuba import MITSUBA_SAMPLES
 from mitsuba_scene import mitsuba_scene, set_variant
 
 import psf_cl
@@ -26,9 +27,6 @@ from psf_cl.errors import InputError
 from psf_cl.files import write_whole
 from psf_cl.image import Image, json_text, write_exr
 from psf_cl.settings import resolve
-
-# Samples that one call of Mitsuba keeps in memory.
-MITSUBA_SAMPLES = 1 << 22
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -45,8 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser.parse_args(arguments)
 
     scene = psf_cl.load_scene(args.scene, size=args.size)
-    settings = resolve(scene.render, scene.path)
     set_variant()
+    settings = resolve(scene.render, scene.path)
     built = mitsuba_scene(scene, settings.max_depth, settings.roulette_depth)
     largest = max(1, MITSUBA_SAMPLES // (scene.width * scene.height))
     # Compiles; a pass of its own, so that render time has no compiling in it.
