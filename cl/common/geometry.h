@@ -13,7 +13,7 @@
 #include "lanes.h"
 #include "layout.h"
 
-#define BOX_SLACK 0x1p-21f // 8 u: 6 for the corners, 2 for the rounding of slack and sum
+#define BOX_SLACK 0x1.4p-21f // 10 u: 6 for the corners, 2 for the rounding of slack and sum, 1 for `shift`
 
 // At least 1 + 2 gamma(3): the far distance of a box must not be rounded below its near distance.
 // Ize: Robust BVH Ray Traversal, JCGT 2 (2), 2013.
@@ -37,9 +37,10 @@ typedef struct {
 
 /// What depends on the ray alone: boxes' rows and planes, and the shear that turns the ray into z.
 typedef struct {
-    float near_origin[3]; // the origin, moved back by its slack
-    float far_origin[3]; // the origin, moved on
     float inverse[3]; // 1 / direction; infinite for 0
+    float far_inverse[3]; // the same times BOX_FAR_FACTOR
+    float near_shift[3]; // minus the origin, moved back by its slack, times inverse
+    float far_shift[3]; // minus the origin, moved on, times far_inverse
     uint near_row[3]; // row of BvhNode.bounds that the ray meets first; the other is near_row ^ 1
     uint axis[3]; // kx, ky, kz: kz is where the direction is longest
     float origin[3]; // along kx, ky, kz
@@ -49,9 +50,10 @@ typedef struct {
 
 /// The same of all lanes.
 typedef struct {
-    float near_origin[3][W];
-    float far_origin[3][W];
     float inverse[3][W];
+    float far_inverse[3][W];
+    float near_shift[3][W];
+    float far_shift[3][W];
     uint axis[W]; // kz
     float origin[3][W];
     float shear[3][W];
@@ -84,15 +86,19 @@ static inline void set_up_rays(RaySetups *rays, Mask active, Vec3 origin, Vec3 d
     const Float slack_x = pick(inverse.x < 0.0f, -slack, slack);
     const Float slack_y = pick(inverse.y < 0.0f, -slack, slack);
     const Float slack_z = pick(inverse.z < 0.0f, -slack, slack);
+    const Vec3 far_inverse = scale(inverse, (Float)(BOX_FAR_FACTOR));
     store_lanes(inverse.x, rays->inverse[0]);
     store_lanes(inverse.y, rays->inverse[1]);
     store_lanes(inverse.z, rays->inverse[2]);
-    store_lanes(origin.x + slack_x, rays->near_origin[0]);
-    store_lanes(origin.y + slack_y, rays->near_origin[1]);
-    store_lanes(origin.z + slack_z, rays->near_origin[2]);
-    store_lanes(origin.x - slack_x, rays->far_origin[0]);
-    store_lanes(origin.y - slack_y, rays->far_origin[1]);
-    store_lanes(origin.z - slack_z, rays->far_origin[2]);
+    store_lanes(far_inverse.x, rays->far_inverse[0]);
+    store_lanes(far_inverse.y, rays->far_inverse[1]);
+    store_lanes(far_inverse.z, rays->far_inverse[2]);
+    store_lanes(-(origin.x + slack_x) * inverse.x, rays->near_shift[0]);
+    store_lanes(-(origin.y + slack_y) * inverse.y, rays->near_shift[1]);
+    store_lanes(-(origin.z + slack_z) * inverse.z, rays->near_shift[2]);
+    store_lanes(-(origin.x - slack_x) * far_inverse.x, rays->far_shift[0]);
+    store_lanes(-(origin.y - slack_y) * far_inverse.y, rays->far_shift[1]);
+    store_lanes(-(origin.z - slack_z) * far_inverse.z, rays->far_shift[2]);
 
     // The winding that Woop et al. keep by swapping kx and ky does not matter without culling.
     const Mask along_x = (x > y) & (x > z);
@@ -117,12 +123,15 @@ static inline void set_up_rays(RaySetups *rays, Mask active, Vec3 origin, Vec3 d
 static inline RaySetup ray_setup(const RaySetups *rays, uint k)
 {
     RaySetup ray;
-    ray.near_origin[0] = rays->near_origin[0][k];
-    ray.near_origin[1] = rays->near_origin[1][k];
-    ray.near_origin[2] = rays->near_origin[2][k];
-    ray.far_origin[0] = rays->far_origin[0][k];
-    ray.far_origin[1] = rays->far_origin[1][k];
-    ray.far_origin[2] = rays->far_origin[2][k];
+    ray.far_inverse[0] = rays->far_inverse[0][k];
+    ray.far_inverse[1] = rays->far_inverse[1][k];
+    ray.far_inverse[2] = rays->far_inverse[2][k];
+    ray.near_shift[0] = rays->near_shift[0][k];
+    ray.near_shift[1] = rays->near_shift[1][k];
+    ray.near_shift[2] = rays->near_shift[2][k];
+    ray.far_shift[0] = rays->far_shift[0][k];
+    ray.far_shift[1] = rays->far_shift[1][k];
+    ray.far_shift[2] = rays->far_shift[2][k];
     ray.inverse[0] = rays->inverse[0][k];
     ray.inverse[1] = rays->inverse[1][k];
     ray.inverse[2] = rays->inverse[2][k];
@@ -232,28 +241,30 @@ static inline BlockHit intersect_block(__global const TriangleBlock *block, cons
 
 /// Return which of a node's eight children the ray may meet up to `limit`, and where it enters.
 ///
-/// Conservative.  Minima and maxima drop NaN (an infinite inverse times 0: the ray slides along a
-/// face, which does not bound it), and empty children are entered at infinity.
+/// Conservative.  Minima and maxima drop NaN or what it stands against (an infinite inverse times what
+/// it is infinitely far from: the ray slides along the face), and empty children are entered at
+/// infinity.  The distances hang on few operations after one another: a ray waits for them.
 static inline int8 intersect_boxes(
     __global const BvhNode *node, const RaySetup *ray, float limit, float8 *entry)
 {
     const uint x = ray->near_row[0];
     const uint y = ray->near_row[1];
     const uint z = ray->near_row[2];
-    const float8 x0 = (vload8(0, node->bounds[x]) - ray->near_origin[0]) * ray->inverse[0];
-    const float8 x1 = (vload8(0, node->bounds[x ^ 1u]) - ray->far_origin[0]) * ray->inverse[0];
-    const float8 y0 = (vload8(0, node->bounds[y]) - ray->near_origin[1]) * ray->inverse[1];
-    const float8 y1 = (vload8(0, node->bounds[y ^ 1u]) - ray->far_origin[1]) * ray->inverse[1];
-    const float8 z0 = (vload8(0, node->bounds[z]) - ray->near_origin[2]) * ray->inverse[2];
-    const float8 z1 = (vload8(0, node->bounds[z ^ 1u]) - ray->far_origin[2]) * ray->inverse[2];
-    float8 near = (float8)(0.0f);
-    float8 far = (float8)(limit);
-    near = x0 > near ? x0 : near;
-    near = y0 > near ? y0 : near;
-    near = z0 > near ? z0 : near;
-    far = x1 < far ? x1 : far;
-    far = y1 < far ? y1 : far;
-    far = z1 < far ? z1 : far;
+    const float8 x0 = fma(vload8(0, node->bounds[x]), (float8)(ray->inverse[0]), (float8)(ray->near_shift[0]));
+    const float8 y0 = fma(vload8(0, node->bounds[y]), (float8)(ray->inverse[1]), (float8)(ray->near_shift[1]));
+    const float8 z0 = fma(vload8(0, node->bounds[z]), (float8)(ray->inverse[2]), (float8)(ray->near_shift[2]));
+    const float8 x1 =
+        fma(vload8(0, node->bounds[x ^ 1u]), (float8)(ray->far_inverse[0]), (float8)(ray->far_shift[0]));
+    const float8 y1 =
+        fma(vload8(0, node->bounds[y ^ 1u]), (float8)(ray->far_inverse[1]), (float8)(ray->far_shift[1]));
+    const float8 z1 =
+        fma(vload8(0, node->bounds[z ^ 1u]), (float8)(ray->far_inverse[2]), (float8)(ray->far_shift[2]));
+    const float8 start = x0 > 0.0f ? x0 : (float8)(0.0f);
+    const float8 end = x1 < limit * BOX_FAR_FACTOR ? x1 : (float8)(limit * BOX_FAR_FACTOR);
+    const float8 enter = y0 > z0 ? y0 : z0;
+    const float8 leave = y1 < z1 ? y1 : z1;
+    const float8 near = enter > start ? enter : start;
+    const float8 far = leave < end ? leave : end;
     *entry = near;
-    return near <= far * BOX_FAR_FACTOR;
+    return near <= far;
 }

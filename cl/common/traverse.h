@@ -222,9 +222,10 @@ static inline Mask trace_any(
 
 /// The boxes' part of the rays' setups, in lanes.
 typedef struct {
-    Vec3 near_origin;
-    Vec3 far_origin;
     Vec3 inverse;
+    Vec3 far_inverse;
+    Vec3 near_shift;
+    Vec3 far_shift;
     Mask backward_x;
     Mask backward_y;
     Mask backward_z;
@@ -233,43 +234,41 @@ typedef struct {
 static inline Bundle bundle_of(const RaySetups *rays)
 {
     Bundle b;
-    b.near_origin = vec3(load_lanes(rays->near_origin[0]), load_lanes(rays->near_origin[1]),
-                         load_lanes(rays->near_origin[2]));
-    b.far_origin = vec3(load_lanes(rays->far_origin[0]), load_lanes(rays->far_origin[1]),
-                        load_lanes(rays->far_origin[2]));
     b.inverse = vec3(load_lanes(rays->inverse[0]), load_lanes(rays->inverse[1]), load_lanes(rays->inverse[2]));
+    b.far_inverse = vec3(load_lanes(rays->far_inverse[0]), load_lanes(rays->far_inverse[1]),
+                         load_lanes(rays->far_inverse[2]));
+    b.near_shift = vec3(load_lanes(rays->near_shift[0]), load_lanes(rays->near_shift[1]),
+                        load_lanes(rays->near_shift[2]));
+    b.far_shift = vec3(load_lanes(rays->far_shift[0]), load_lanes(rays->far_shift[1]),
+                       load_lanes(rays->far_shift[2]));
     b.backward_x = b.inverse.x < 0.0f;
     b.backward_y = b.inverse.y < 0.0f;
     b.backward_z = b.inverse.z < 0.0f;
     return b;
 }
 
-/// As intersect_boxes: which rays may meet child `c` up to `limit`, and where they enter.
-static inline Mask intersect_box(
-    __global const BvhNode *node, uint c, const Bundle *rays, Float limit, Float *entry)
+/// As intersect_boxes: which rays may meet child `c` up to `limit`.
+static inline Mask intersect_box(__global const BvhNode *node, uint c, const Bundle *rays, Float limit)
 {
-    const Float x0 = (Float)(node->bounds[0][c]);
-    const Float x1 = (Float)(node->bounds[1][c]);
-    const Float y0 = (Float)(node->bounds[2][c]);
-    const Float y1 = (Float)(node->bounds[3][c]);
-    const Float z0 = (Float)(node->bounds[4][c]);
-    const Float z1 = (Float)(node->bounds[5][c]);
-    const Float enter_x = (pick(rays->backward_x, x1, x0) - rays->near_origin.x) * rays->inverse.x;
-    const Float leave_x = (pick(rays->backward_x, x0, x1) - rays->far_origin.x) * rays->inverse.x;
-    const Float enter_y = (pick(rays->backward_y, y1, y0) - rays->near_origin.y) * rays->inverse.y;
-    const Float leave_y = (pick(rays->backward_y, y0, y1) - rays->far_origin.y) * rays->inverse.y;
-    const Float enter_z = (pick(rays->backward_z, z1, z0) - rays->near_origin.z) * rays->inverse.z;
-    const Float leave_z = (pick(rays->backward_z, z0, z1) - rays->far_origin.z) * rays->inverse.z;
-    Float near = (Float)(0.0f);
-    Float far = limit;
-    near = enter_x > near ? enter_x : near;
-    near = enter_y > near ? enter_y : near;
-    near = enter_z > near ? enter_z : near;
-    far = leave_x < far ? leave_x : far;
-    far = leave_y < far ? leave_y : far;
-    far = leave_z < far ? leave_z : far;
-    *entry = near;
-    return near <= far * BOX_FAR_FACTOR;
+    const Float x_low = (Float)(node->bounds[0][c]);
+    const Float x_high = (Float)(node->bounds[1][c]);
+    const Float y_low = (Float)(node->bounds[2][c]);
+    const Float y_high = (Float)(node->bounds[3][c]);
+    const Float z_low = (Float)(node->bounds[4][c]);
+    const Float z_high = (Float)(node->bounds[5][c]);
+    const Float x0 = fma(pick(rays->backward_x, x_high, x_low), rays->inverse.x, rays->near_shift.x);
+    const Float y0 = fma(pick(rays->backward_y, y_high, y_low), rays->inverse.y, rays->near_shift.y);
+    const Float z0 = fma(pick(rays->backward_z, z_high, z_low), rays->inverse.z, rays->near_shift.z);
+    const Float x1 = fma(pick(rays->backward_x, x_low, x_high), rays->far_inverse.x, rays->far_shift.x);
+    const Float y1 = fma(pick(rays->backward_y, y_low, y_high), rays->far_inverse.y, rays->far_shift.y);
+    const Float z1 = fma(pick(rays->backward_z, z_low, z_high), rays->far_inverse.z, rays->far_shift.z);
+    Float near = x0 > 0.0f ? x0 : (Float)(0.0f);
+    Float far = x1 < limit * BOX_FAR_FACTOR ? x1 : limit * BOX_FAR_FACTOR;
+    near = y0 > near ? y0 : near;
+    near = z0 > near ? z0 : near;
+    far = y1 < far ? y1 : far;
+    far = z1 < far ? z1 : far;
+    return near <= far;
 }
 
 /// Return the first hits of the rays; of equally near ones that of the lowest index.
@@ -338,8 +337,7 @@ static inline Mask trace_any(
         }
         __global const BvhNode *node = &nodes[next];
         for (uint c = 0; c < 8 && count < STACK_SIZE; ++c) {
-            Float entry;
-            const uint met = lanes & lane_bits(intersect_box(node, c, &bundle, t_max, &entry));
+            const uint met = lanes & lane_bits(intersect_box(node, c, &bundle, t_max));
             if (met) {
                 entered[count] = met;
                 waiting[count++] = node->child[c];
