@@ -78,9 +78,31 @@ LARGE_FUNCTION Edges careful_edges(Float ax, Float ay, Float bx, Float by, Float
     return e;
 }
 
+// Faces are looked at in runs of so many: first whether some ray is inside of each, without a branch that
+// no processor could foresee, then those that are.
+#define FACE_RUN 32u
+
+/// Bit k is set where one of the rays may meet the plane of face `first` + k inside of its edges.
+inline uint met_faces(const SeenCorners *seen, __global const uint *faces, uint first, uint count, Mask active)
+{
+    uint bits = 0;
+    for (uint k = 0; k < count; ++k) {
+// A contracted a * b - c * d is not the negative of c * d - a * b.
+#pragma OPENCL FP_CONTRACT OFF
+        const uint4 face = vload4(first + k, faces);
+        const Float u = seen->x[face.z] * seen->y[face.y] - seen->y[face.z] * seen->x[face.y];
+        const Float v = seen->x[face.x] * seen->y[face.z] - seen->y[face.x] * seen->x[face.z];
+        const Float w = seen->x[face.y] * seen->y[face.x] - seen->y[face.y] * seen->x[face.x];
+        const Float least = min(u, min(v, w));
+        const Float most = max(u, max(v, w));
+        // Not the contrary: what overflowed to NaN has to be looked at.
+        bits |= (uint)any_lane(active & !((least < 0.0f) & (most > 0.0f))) << k;
+    }
+    return bits;
+}
+
 inline Edges edges_of(const SeenCorners *seen, uint a, uint b, uint c, Mask active)
 {
-// A contracted a * b - c * d is not the negative of c * d - a * b.
 #pragma OPENCL FP_CONTRACT OFF
     const Float ax = seen->x[a];
     const Float bx = seen->x[b];
@@ -94,10 +116,7 @@ inline Edges edges_of(const SeenCorners *seen, uint a, uint b, uint c, Mask acti
     e.w = bx * ay - by * ax;
     const Float least = min(e.u, min(e.v, e.w));
     const Float most = max(e.u, max(e.v, e.w));
-    // Not the contrary: what overflowed to NaN has to be looked at.
     e.inside = active & !((least < 0.0f) & (most > 0.0f));
-    if (!any_lane(e.inside))
-        return e;
     e.determinant = e.u + e.v + e.w;
     const Float size = fabs(e.determinant);
     const Mask doubtful =
@@ -131,28 +150,29 @@ inline Hits trace_closest_few(
     best.u = (Float)(0.0f);
     best.v = (Float)(0.0f);
     best.triangle = (UInt)(NO_HIT);
-    for (uint k = 0; k < params->face_count; ++k) {
-        const uint4 face = vload4(k, faces);
-        const Edges e = edges_of(&seen, face.x, face.y, face.z, active);
-        if (!any_lane(e.inside))
-            continue;
-        const UInt minus = as_bits(e.determinant) & 0x80000000u;
-        const Float determinant = from_bits(as_bits(e.determinant) ^ minus);
-        const Float distance = from_bits(
-            as_bits(e.u * seen.z[face.x] + e.v * seen.z[face.y] + e.w * seen.z[face.z]) ^ minus);
-        Mask nearer = e.inside & (distance > 0.0f) & (distance * size < far * determinant);
+    for (uint first = 0; first < params->face_count; first += FACE_RUN) {
+        uint met = met_faces(&seen, faces, first, min(params->face_count - first, FACE_RUN), active);
+        for (; met; met &= met - 1u) {
+            const uint4 face = vload4(first + lowest_bit(met), faces);
+            const Edges e = edges_of(&seen, face.x, face.y, face.z, active);
+            const UInt minus = as_bits(e.determinant) & 0x80000000u;
+            const Float determinant = from_bits(as_bits(e.determinant) ^ minus);
+            const Float distance = from_bits(
+                as_bits(e.u * seen.z[face.x] + e.v * seen.z[face.y] + e.w * seen.z[face.z]) ^ minus);
+            Mask nearer = e.inside & (distance > 0.0f) & (distance * size < far * determinant);
 #if ALPHA
-        if (face.w & ALPHA_BIT) {
-            const Float inverse = 1.0f / e.determinant;
-            nearer &= alpha_passes_lanes(nearer, (UInt)(face.w & ~ALPHA_BIT), e.v * inverse, e.w * inverse
-                                         ALPHA_ARGUMENTS);
-        }
+            if (face.w & ALPHA_BIT) {
+                const Float inverse = 1.0f / e.determinant;
+                nearer &= alpha_passes_lanes(nearer, (UInt)(face.w & ~ALPHA_BIT), e.v * inverse, e.w * inverse
+                                             ALPHA_ARGUMENTS);
+            }
 #endif
-        far = pick(nearer, distance, far);
-        size = pick(nearer, determinant, size);
-        best.u = pick(nearer, from_bits(as_bits(e.v) ^ minus), best.u);
-        best.v = pick(nearer, from_bits(as_bits(e.w) ^ minus), best.v);
-        best.triangle = pick_u(nearer, (UInt)(face.w & ~ALPHA_BIT), best.triangle);
+            far = pick(nearer, distance, far);
+            size = pick(nearer, determinant, size);
+            best.u = pick(nearer, from_bits(as_bits(e.v) ^ minus), best.u);
+            best.v = pick(nearer, from_bits(as_bits(e.w) ^ minus), best.v);
+            best.triangle = pick_u(nearer, (UInt)(face.w & ~ALPHA_BIT), best.triangle);
+        }
     }
     const Float inverse = 1.0f / size;
     best.t = far * inverse;
@@ -173,24 +193,25 @@ inline Mask trace_any_few(
     SeenCorners seen;
     see_corners(params, corners, origin, toward, &seen);
     Mask waiting = active;
-    for (uint k = 0; k < params->face_count; ++k) {
-        const uint4 face = vload4(k, faces);
-        const Edges e = edges_of(&seen, face.x, face.y, face.z, waiting);
-        if (!any_lane(e.inside))
-            continue;
-        const UInt minus = as_bits(e.determinant) & 0x80000000u;
-        const Float determinant = from_bits(as_bits(e.determinant) ^ minus);
-        const Float distance = from_bits(
-            as_bits(e.u * seen.z[face.x] + e.v * seen.z[face.y] + e.w * seen.z[face.z]) ^ minus);
-        Mask met = e.inside & (distance > 0.0f) & (distance < determinant);
+    for (uint first = 0; first < params->face_count; first += FACE_RUN) {
+        uint met = met_faces(&seen, faces, first, min(params->face_count - first, FACE_RUN), waiting);
+        for (; met; met &= met - 1u) {
+            const uint4 face = vload4(first + lowest_bit(met), faces);
+            const Edges e = edges_of(&seen, face.x, face.y, face.z, waiting);
+            const UInt minus = as_bits(e.determinant) & 0x80000000u;
+            const Float determinant = from_bits(as_bits(e.determinant) ^ minus);
+            const Float distance = from_bits(
+                as_bits(e.u * seen.z[face.x] + e.v * seen.z[face.y] + e.w * seen.z[face.z]) ^ minus);
+            Mask there = e.inside & (distance > 0.0f) & (distance < determinant);
 #if ALPHA
-        if (face.w & ALPHA_BIT) {
-            const Float inverse = 1.0f / e.determinant;
-            met &= alpha_passes_lanes(met, (UInt)(face.w & ~ALPHA_BIT), e.v * inverse, e.w * inverse
-                                      ALPHA_ARGUMENTS);
-        }
+            if (face.w & ALPHA_BIT) {
+                const Float inverse = 1.0f / e.determinant;
+                there &= alpha_passes_lanes(there, (UInt)(face.w & ~ALPHA_BIT), e.v * inverse, e.w * inverse
+                                          ALPHA_ARGUMENTS);
+            }
 #endif
-        waiting &= !met;
+            waiting &= !there;
+        }
         if (!any_lane(waiting))
             break;
     }
