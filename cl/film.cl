@@ -11,7 +11,7 @@ inline int pass_is_complete(__global const Params *params, const volatile __glob
 }
 
 /// Add one value to a compensated sum, so that the millionth sample still counts (Kahan 1965).
-inline void add_compensated(__global FilmSum *sum, uint c, float value)
+inline void add_compensated(FilmSum *sum, uint c, float value)
 {
     const float y = value - sum->lost[c];
     const float t = sum->sum[c] + y;
@@ -19,7 +19,7 @@ inline void add_compensated(__global FilmSum *sum, uint c, float value)
     sum->sum[c] = t;
 }
 
-inline void add_sample(__global FilmSum *sum, float4 sample)
+inline void add_sample(FilmSum *sum, float4 sample)
 {
     if (sample.w <= 0.0f)
         return;
@@ -34,7 +34,16 @@ inline void add_sample(__global FilmSum *sum, float4 sample)
     sum->squares = min(sum->squares + delta * (y - sum->mean), FLT_MAX);
 }
 
-/// Add every complete pass to the film.  One work item a pixel and plane.
+/// Passes that are complete and wanted, from film_pass on.
+inline uint complete_passes(__global const Params *params, const volatile __global uint *counters)
+{
+    uint done = 0;
+    while (pass_is_complete(params, counters, done)) // at most params->ring
+        ++done;
+    return done;
+}
+
+/// Add every complete pass to the film.  One work item W sums: mostly there is nothing to add.
 ///
 /// `planes` of `ring * pixel_count` weighted samples each; a weight of 0 means that there is none.
 /// With `partial` set, the samples of the first pass that are there (an interrupted first pass).
@@ -49,19 +58,21 @@ kernel void add_samples(
     const uint planes,
     const uint partial)
 {
-    const uint i = get_global_id(0);
-    if (i >= params->pixel_count * planes)
+    const uint passes = partial ? 1u : complete_passes(params, counters);
+    if (passes == 0)
         return;
-    const uint plane = i / params->pixel_count;
-    const uint pixel = i - plane * params->pixel_count;
-    for (uint k = 0; k < params->ring; ++k) {
-        if (!partial && !pass_is_complete(params, counters, k))
-            break;
-        const ulong pass = (counters[COUNTER_FILM_PASS] + k) & (params->ring - 1u);
-        const ulong at = ((ulong)plane * params->ring + pass) * params->pixel_count + pixel;
-        add_sample(&film[i], vload4(at, samples));
-        if (partial)
-            break;
+    const uint first = get_global_id(0) * W;
+    const uint end = min(first + W, params->pixel_count * planes);
+    for (uint i = first; i < end; ++i) {
+        const uint plane = i / params->pixel_count;
+        const uint pixel = i - plane * params->pixel_count;
+        FilmSum sum = film[i];
+        for (uint k = 0; k < passes; ++k) {
+            const ulong pass = (counters[COUNTER_FILM_PASS] + k) & (params->ring - 1u);
+            const ulong at = ((ulong)plane * params->ring + pass) * params->pixel_count + pixel;
+            add_sample(&sum, vload4(at, samples));
+        }
+        film[i] = sum;
     }
 }
 
@@ -75,7 +86,7 @@ inline int pass_is_in_half(uint pass)
     return (pass >> ((31u - clz(pass | 1u)) >> 1)) & 1u;
 }
 
-/// Add every complete pass of the second half.  One work item a pixel, before advance_film.
+/// Add every complete pass of the second half.  One work item W pixels, before advance_film.
 ///
 /// reads   samples, counters
 /// writes  film_half
@@ -85,14 +96,20 @@ kernel void add_half(
     const volatile __global uint *counters,
     __global FilmSum *film_half)
 {
-    const uint pixel = get_global_id(0);
-    if (pixel >= params->pixel_count)
+    const uint passes = complete_passes(params, counters);
+    if (passes == 0)
         return;
-    for (uint k = 0; pass_is_complete(params, counters, k); ++k) {
-        const uint pass = counters[COUNTER_FILM_PASS] + k;
-        const ulong at = (ulong)(pass & (params->ring - 1u)) * params->pixel_count + pixel;
-        if (pass_is_in_half(pass))
-            add_sample(&film_half[pixel], vload4(at, samples));
+    const uint first = get_global_id(0) * W;
+    const uint end = min(first + W, params->pixel_count);
+    for (uint pixel = first; pixel < end; ++pixel) {
+        FilmSum sum = film_half[pixel];
+        for (uint k = 0; k < passes; ++k) {
+            const uint pass = counters[COUNTER_FILM_PASS] + k;
+            const ulong at = (ulong)(pass & (params->ring - 1u)) * params->pixel_count + pixel;
+            if (pass_is_in_half(pass))
+                add_sample(&sum, vload4(at, samples));
+        }
+        film_half[pixel] = sum;
     }
 }
 
@@ -103,9 +120,7 @@ kernel void advance_film(__global const Params *params, volatile __global uint *
 {
     if (get_global_id(0) != 0 || params->pixel_count == 0)
         return;
-    uint done = 0;
-    while (pass_is_complete(params, counters, done)) // at most params->ring
-        ++done;
+    const uint done = complete_passes(params, counters);
     const uint pass = counters[COUNTER_FILM_PASS];
     for (uint k = 0; k < done; ++k)
         counters[COUNTER_FINISHED + ((pass + k) & (params->ring - 1u))] = 0;

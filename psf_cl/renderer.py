@@ -122,10 +122,13 @@ class Renderer:
 
     def _film(self) -> None:
         for launch, planes in self.film_launches:
-            launch(planes * self.plan.pixel_count, film.GROUP)
+            launch(self._film_items(planes), film.GROUP)
         if self.half is not None:
-            self.half(self.plan.pixel_count, film.GROUP)
+            self.half(self._film_items(1), film.GROUP)
         self.advance(1)
+
+    def _film_items(self, planes: int) -> int:
+        return -(-planes * self.plan.pixel_count // self.plan.traits.lanes)
 
     def _counters(self) -> np.ndarray:
         if self.statistics and self.looks % LOOKS_PER_CENSUS == 1:
@@ -245,7 +248,7 @@ class Renderer:
                 # Not one pass is complete: what is there of the first is all there is.
                 self.device.fill(self.buffers[name])
                 self._add_launch(ring, name, planes, partial=True)(
-                    planes * self.plan.pixel_count, film.GROUP
+                    self._film_items(planes), film.GROUP
                 )
             sums[name] = self.device.read(self.buffers[name]).reshape(planes, -1)
             if partial:
