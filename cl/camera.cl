@@ -16,6 +16,28 @@ inline UInt exponent_bits(Vec3 v)
 // From 2^96 on, a film's sums could overflow.
 #define MAX_EXPONENT_BITS 0x6f800000u
 
+/// x / d for all lanes: the processor divides no vectors of integers.
+inline UInt divide(UInt x, uint d)
+{
+    // The reciprocal is at most 1 too small, so the quotient is.
+    const UInt q = mul_hi(x, (UInt)(0xffffffffu / d));
+    return q + pick_u(x - q * d >= d, (UInt)(1u), (UInt)(0u));
+}
+
+/// Column and row on the film of entry `i` of the queue's order (tables.pixel_order).
+inline void pixel_place(__global const Params *params, UInt i, UInt *x, UInt *y)
+{
+    const uint strip_pixels = STRIP_ROWS * params->crop_width;
+    const UInt strip = divide(i, strip_pixels);
+    const UInt inside = i - strip * strip_pixels;
+    const UInt top = strip * STRIP_ROWS;
+    const UInt rows = min((UInt)(STRIP_ROWS), params->crop_height - top);
+    // Exact: `inside` is below 2^18, and a quotient plus half a row is far from integers.
+    const UInt column = to_uint((to_float(inside) + 0.5f) / to_float(rows));
+    *x = params->crop_x + column;
+    *y = params->crop_y + top + inside - column * rows;
+}
+
 /// Hand in finished paths, give free slots the next (pixel, sample), start those whose pass may start.
 ///
 /// A slot that took a sample of a pass that may not start yet keeps it and waits, so every sample is
@@ -23,12 +45,11 @@ inline UInt exponent_bits(Vec3 v)
 ///
 /// A sample that is not finite, or too large to be summed, is handed in as black and counted.
 ///
-/// reads   pool, counters, pixel_order
+/// reads   pool, counters
 /// writes  pool; samples (and direct) of finished paths; counters.{next_pixel, finished[],
 ///         rejected_samples, pending_camera}
 kernel void regenerate_paths(
     __global const Params *params,
-    __global const uint *pixel_order,
     __global float *pool,
     volatile __global uint *counters,
 #if AOV_DIRECT
@@ -123,11 +144,9 @@ kernel void regenerate_paths(
     const Mask start = (status == STATUS_WAITING) & (sample < min(limit, window));
     if (any_lane(start)) {
         atomic_add(&counters[COUNTER_PENDING_CAMERA], count_lanes(start));
-        const UInt at = pick_u(start, pixel, (UInt)(0u));
-        // x in the low half, y in the high half.
-        const UInt xy = GATHER_WORD(pixel_order, at);
-        const UInt x = xy & 0xffffu;
-        const UInt y = xy >> 16;
+        UInt x;
+        UInt y;
+        pixel_place(params, pick_u(start, pixel, (UInt)(0u)), &x, &y);
         const UInt seed = pixel_seed(y * params->width + x, params->seed);
         Float u1;
         Float u2;

@@ -353,11 +353,8 @@ class Renderer:
         for stage in self.plan.stages:
             for spec in stage.buffers:
                 self.buffers[spec.name] = self.device.allocate(spec.name, spec.dtype, spec.count)
-        x, y, width, _ = self.plan.crop
-        order = tables.pixel_order(*self.plan.crop)
-        self.device.write(self.buffers["pixel_order"], order)
-        # Where each entry of the order lies in the crop.
-        self.order = ((order >> 16) - y) * width + ((order & 0xFFFF) - x)
+        # Where each pixel of the queue's order lies in the crop.
+        self.order = tables.pixel_order(*self.plan.crop[2:])
 
     def _upload_scene(self) -> tables.Geometry:
         scene, planned = self.scene, {spec.name for spec in self.plan.scene_buffers}
@@ -408,6 +405,10 @@ class Renderer:
             "width": scene.width,
             "height": scene.height,
             "pixel_count": self.plan.pixel_count,
+            "crop_x": self.plan.crop[0],
+            "crop_y": self.plan.crop[1],
+            "crop_width": self.plan.crop[2],
+            "crop_height": self.plan.crop[3],
             "ring": self.plan.ring,
             "slots": self.plan.traits.slots,
             "seed": settings.seed,

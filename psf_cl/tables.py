@@ -442,26 +442,19 @@ def environment_cells(environment: Environment) -> np.ndarray:
     return cells
 
 
-def pixel_order(x: int, y: int, width: int, height: int) -> np.ndarray:
-    """Return the pixels of a crop as ``row << 16 | column``, ``(width * height,)`` uint32.
+def pixel_order(width: int, height: int) -> np.ndarray:
+    """Return the pixels of a crop, ``row * width + column``, in the order of the queue.
 
-    Along a Morton curve, so that the lanes of a block, and the slots in flight, see neighbours.
+    Strips of layout.STRIP_ROWS rows, each column by column, as regenerate_paths counts them: the lanes of
+    a block see neighbours.
+
+    Returns:
+        ``(width * height,)`` int64.
     """
-    columns, rows = np.meshgrid(
-        np.arange(width, dtype=np.uint64), np.arange(height, dtype=np.uint64)
-    )
-
-    def spread(v: np.ndarray) -> np.ndarray:
-        v = (v | (v << 8)) & 0x00FF00FF
-        v = (v | (v << 4)) & 0x0F0F0F0F
-        v = (v | (v << 2)) & 0x33333333
-        return (v | (v << 1)) & 0x55555555
-
-    code = spread(columns.ravel()) | (spread(rows.ravel()) << np.uint64(1))
-    order = np.argsort(code, kind="stable")
-    return (((rows.ravel() + np.uint64(y)) << np.uint64(16)) | (columns.ravel() + np.uint64(x)))[
-        order
-    ].astype(np.uint32)
+    pixels = np.arange(width * height).reshape(height, width)
+    rows = layout.CONSTANT["STRIP_ROWS"]
+    strips = [pixels[top : top + rows].T.ravel() for top in range(0, height, rows)]
+    return np.concatenate(strips)
 
 
 def camera_values(camera: Camera, width: int, height: int) -> dict[str, object]:

@@ -134,9 +134,9 @@ def hand_in(device, radiance, direct):
     words[at[0], places["pixel"], at[1]] = slot
     params = np.zeros(1, layout.PARAMS.dtype)
     params["pixel_count"], params["ring"], params["slots"] = count, 1, traits.slots
+    params["crop_width"], params["crop_height"] = count, 1
     buffers = {
         "params": device.upload("params", params),
-        "pixel_order": device.allocate("pixel_order", np.uint32, count),
         "pool": device.upload("pool", pool.ravel()),
         "counters": device.allocate("counters", np.uint32, AT["finished"] + 1),
         "samples": device.allocate("samples", np.float32, count * 4),
@@ -144,7 +144,7 @@ def hand_in(device, radiance, direct):
     }
     flags = (
         "TEXTURES ALPHA SMOOTH TRANSMISSION AREA_LIGHTS PUNCTUAL_LIGHTS ENVIRONMENT CONNECT LENS"
-        " AOV_FEATURES"
+        " AOV_FEATURES FEW GLOSSY"
     ).split()
     program = load_program(device, "camera.cl", dict.fromkeys(flags, 0) | {"AOV_DIRECT": 1})
     program.bind("regenerate_paths", **buffers)(traits.slots // traits.lanes)

@@ -57,7 +57,7 @@ CHOICES = [*PARTS, *LIGHTS, *SKIES, "LENS", *OUTPUTS]
 
 ALWAYS = {
     *("params", "blocks", "nodes", "surfaces", "materials"),
-    *("pool", "pixel_order", "counters", "samples", "film"),
+    *("pool", "counters", "samples", "film"),
 }
 TEXTURE_BUFFERS = {"uvs", "textures", "texels", "srgb_to_linear"}
 NEEDED = {

@@ -162,22 +162,14 @@ def test_textures_lie_one_after_the_other():
     assert len(records) == len(texels) == 1
 
 
-@pytest.mark.parametrize(
-    "crop",
-    [(0, 0, 1, 1), (0, 0, 16, 16), (3, 5, 7, 13), (100, 0, 1, 37), (65530, 65531, 6, 5)],
-    ids=str,
-)
-def test_pixel_order_visits_every_pixel_of_the_crop_once(crop):
-    x, y, width, height = crop
-    order = tables.pixel_order(*crop)
-    assert order.dtype == np.uint32
-    visited = sorted(zip((order >> 16).tolist(), (order & 0xFFFF).tolist(), strict=True))
-    assert visited == [(y + j, x + i) for j in range(height) for i in range(width)]
+@pytest.mark.parametrize("size", [(1, 1), (16, 16), (7, 13), (1, 37), (6, 5)], ids=str)
+def test_pixel_order_visits_every_pixel_once(size):
+    order = tables.pixel_order(*size)
+    np.testing.assert_array_equal(np.sort(order), np.arange(size[0] * size[1]))
 
 
 def test_pixel_order_keeps_neighbours_together():
-    order = tables.pixel_order(0, 0, 64, 64).reshape(-1, 16)
-    rows, columns = order >> 16, order & 0xFFFF
+    rows, columns = np.divmod(tables.pixel_order(64, 64).reshape(-1, 16), 64)
     assert (np.ptp(rows, axis=1) == 3).all() and (np.ptp(columns, axis=1) == 3).all()
 
 

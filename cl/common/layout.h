@@ -24,6 +24,7 @@
 #define DIRECT_BSDF 2u
 #define SAMPLER_SOBOL 0u
 #define SAMPLER_RANDOM 1u
+#define STRIP_ROWS 4u // rows of pixels that the queue takes column by column
 #define STATUS_IDLE 0u // the slot has no path yet
 #define STATUS_WAITING 0x40000000u // it holds a sample whose pass may not start yet
 #define STATUS_ALIVE 0x80000000u // it traces a ray
@@ -95,6 +96,10 @@ typedef struct {
     uint width; // pixels of the whole film
     uint height; // pixels of the whole film
     uint pixel_count; // pixels that are rendered
+    uint crop_x; // first column that is rendered
+    uint crop_y; // first row that is rendered
+    uint crop_width; // columns that are rendered
+    uint crop_height; // rows that are rendered
     uint ring; // passes that may be in flight
     uint slots; // paths of the pool
     uint seed; // start of every random sequence
@@ -111,6 +116,7 @@ typedef struct {
     uint sampler; // SAMPLER_SOBOL or SAMPLER_RANDOM
     uint corner_count; // of the list of corners, where all triangles are tested
     uint face_count; // triangles between those corners
+    uint pad[3]; // fills the record
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.

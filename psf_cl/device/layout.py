@@ -69,6 +69,10 @@ PARAMS = Record(
     uint width - pixels of the whole film
     uint height - pixels of the whole film
     uint pixel_count - pixels that are rendered
+    uint crop_x - first column that is rendered
+    uint crop_y - first row that is rendered
+    uint crop_width - columns that are rendered
+    uint crop_height - rows that are rendered
     uint ring - passes that may be in flight
     uint slots - paths of the pool
     uint seed - start of every random sequence
@@ -85,6 +89,7 @@ PARAMS = Record(
     uint sampler - SAMPLER_SOBOL or SAMPLER_RANDOM
     uint corner_count - of the list of corners, where all triangles are tested
     uint face_count - triangles between those corners
+    uint pad[3] - fills the record
     """),
 )
 
@@ -334,6 +339,7 @@ CONSTANTS = (
     ("DIRECT_BSDF", 2, ""),
     ("SAMPLER_SOBOL", 0, ""),
     ("SAMPLER_RANDOM", 1, ""),
+    ("STRIP_ROWS", 4, "rows of pixels that the queue takes column by column"),
     ("STATUS_IDLE", 0, "the slot has no path yet"),
     ("STATUS_WAITING", 0x40000000, "it holds a sample whose pass may not start yet"),
     ("STATUS_ALIVE", 0x80000000, "it traces a ray"),

@@ -15,7 +15,6 @@ def plan(context: Context) -> StageSpec:
     float32, uint32 = np.dtype(np.float32), np.dtype(np.uint32)
     buffers = [
         BufferSpec("pool", float32, slots * len(layout.PATH_FIELDS), f"state of {slots} paths"),
-        BufferSpec("pixel_order", uint32, context.pixel_count, "pixels in the order of the queue"),
         BufferSpec(
             "counters", uint32, layout.COUNTER_INDEX["finished"] + context.ring, "queue and rays"
         ),
