@@ -38,29 +38,40 @@ inline void pixel_place(__global const Params *params, UInt i, UInt *x, UInt *y)
     *y = params->crop_y + top + inside - column * rows;
 }
 
-/// Hand in finished paths, give free slots the next (pixel, sample), start those whose pass may start.
+/// Slots that have nothing to do but take the next sample.
+inline Mask is_free(UInt status)
+{
+    return ((status & STATUS_MASK) == STATUS_DONE) | ((status & STATUS_MASK) == STATUS_IDLE);
+}
+
+/// What a work item counts on its way, to disturb the others seldom.
+typedef struct {
+    uint pass;     // of the ring
+    uint finished; // samples of that pass
+    uint started;  // paths
+} Tally;
+
+inline void hand_in(Tally *tally, volatile __global uint *counters)
+{
+    if (tally->finished > 0)
+        atomic_add(&counters[COUNTER_FINISHED + tally->pass], tally->finished);
+    tally->finished = 0;
+}
+
+/// Regenerate the W paths of a work item.
 ///
-/// A slot that took a sample of a pass that may not start yet keeps it and waits, so every sample is
-/// started exactly once.  Which slot gets which sample does not show in the image.
-///
-/// A sample that is not finite, or too large to be summed, is handed in as black and counted.
-///
-/// reads   pool, counters
-/// writes  pool; samples (and direct) of finished paths; counters.{next_pixel, finished[],
-///         rejected_samples, pending_camera}
-kernel void regenerate_paths(
+/// `claimed` is the next entry of the queue that is theirs; returns the one after the last they took.
+inline uint regenerate(
     __global const Params *params,
-    __global float *pool,
+    __global Float *path,
+    uint claimed,
+    Tally *tally,
     volatile __global uint *counters,
 #if AOV_DIRECT
     __global float *direct,
 #endif
     __global float *samples)
 {
-    const uint item = get_global_id(0);
-    if (item >= params->slots / W)
-        return;
-    __global Float *path = pool_at(pool, item);
     UInt status = get_u(path, PATH_STATUS);
     UInt sample = get_u(path, PATH_SAMPLE);
     UInt pixel = get_u(path, PATH_PIXEL);
@@ -105,7 +116,6 @@ kernel void regenerate_paths(
             vstore4((float4)(lane_direct[0][k], lane_direct[1][k], lane_direct[2][k], 1.0f), at, direct);
 #endif
         }
-        // Neighbours mostly belong to one pass: one atomic for all of a pass.
         Mask uncounted = done;
         for (uint k = 0; k < W; ++k) {
             const uint left = lane_bits(uncounted);
@@ -113,14 +123,18 @@ kernel void regenerate_paths(
                 break;
             const uint counted = lane_pass[lowest_bit(left)];
             const Mask same = uncounted & (pass == counted);
-            atomic_add(&counters[COUNTER_FINISHED + counted], count_lanes(same));
+            if (counted != tally->pass)
+                hand_in(tally, counters);
+            tally->pass = counted;
+            tally->finished += count_lanes(same);
             uncounted &= !same;
         }
     }
 
-    const Mask free = done | ((status & STATUS_MASK) == STATUS_IDLE);
+    const Mask free = is_free(status);
     if (any_lane(free)) {
-        const uint first = atomic_add(&counters[COUNTER_NEXT_PIXEL], count_lanes(free));
+        const uint first = claimed;
+        claimed += count_lanes(free);
         const uint first_pass = first / pixel_count;
         UInt next = lanes_before(free) + (first - first_pass * pixel_count);
         UInt pass = (UInt)(counters[COUNTER_NEXT_PASS] + first_pass);
@@ -143,7 +157,7 @@ kernel void regenerate_paths(
     const uint window = counters[COUNTER_FILM_PASS] + params->ring;
     const Mask start = (status == STATUS_WAITING) & (sample < min(limit, window));
     if (any_lane(start)) {
-        atomic_add(&counters[COUNTER_PENDING_CAMERA], count_lanes(start));
+        tally->started += count_lanes(start);
         UInt x;
         UInt y;
         pixel_place(params, pick_u(start, pixel, (UInt)(0u)), &x, &y);
@@ -186,4 +200,45 @@ kernel void regenerate_paths(
         status = pick_u(start, (UInt)(STATUS_ALIVE), status);
     }
     put_u(path, PATH_STATUS, status);
+    return claimed;
+}
+
+/// Hand in finished paths, give free slots the next (pixel, sample), start those whose pass may start.
+///
+/// A slot that took a sample of a pass that may not start yet keeps it and waits, so every sample is
+/// started exactly once.  Which slot gets which sample does not show in the image.
+///
+/// A sample that is not finite, or too large to be summed, is handed in as black and counted.
+///
+/// reads   pool, counters
+/// writes  pool; samples (and direct) of finished paths; counters.{next_pixel, finished[],
+///         rejected_samples, pending_camera}
+kernel void regenerate_paths(
+    __global const Params *params,
+    __global float *pool,
+    volatile __global uint *counters,
+#if AOV_DIRECT
+    __global float *direct,
+#endif
+    __global float *samples)
+{
+    const uint first = get_global_id(0) * RUN;
+    const uint end = min(first + RUN, params->slots / W);
+    uint wanted = 0;
+    for (uint item = first; item < end; ++item)
+        wanted += count_lanes(is_free(get_u(pool_at(pool, item), PATH_STATUS)));
+    uint claimed = wanted > 0 ? atomic_add(&counters[COUNTER_NEXT_PIXEL], wanted) : 0;
+    Tally tally;
+    tally.pass = 0;
+    tally.finished = 0;
+    tally.started = 0;
+    for (uint item = first; item < end; ++item)
+        claimed = regenerate(params, pool_at(pool, item), claimed, &tally, counters,
+#if AOV_DIRECT
+                             direct,
+#endif
+                             samples);
+    hand_in(&tally, counters);
+    if (tally.started > 0)
+        atomic_add(&counters[COUNTER_PENDING_CAMERA], tally.started);
 }

@@ -6,29 +6,14 @@
 #include "common/pool.h"
 #include "common/trace.h"
 
-/// Trace the shadow rays and add what arrives to their paths.
-///
-/// Also paths that have ended may have a last one.
-///
-/// reads   pool.{shadow, toward, light}; geometry
-/// writes  pool.radiance (direct), pool.light (cleared); counters.pending_shadow
-kernel void connect_lights(
-    __global const Params *params,
-    __global float *pool,
-    volatile __global uint *counters,
-    GEOMETRY_PARAMETERS)
+/// Trace the shadow rays of the W paths of a work item; returns how many there were.
+inline uint connect_paths(__global const Params *params, __global Float *path, GEOMETRY_PARAMETERS)
 {
-    const uint item = get_global_id(0);
-    if (item >= params->slots / W)
-        return;
-    __global Float *path = pool_at(pool, item);
     const Vec3 light = get_v(path, PATH_LIGHT_R);
     // Not a number must not vanish here: it goes on into the sample, which is rejected and counted.
     const Mask wanted = !(light.x + light.y + light.z <= 0.0f);
     if (!any_lane(wanted))
-        return;
-    atomic_add(&counters[COUNTER_PENDING_SHADOW], count_lanes(wanted));
-
+        return 0;
     const Mask blocked = blocked_rays(params, wanted, get_v(path, PATH_SHADOW_X), get_v(path, PATH_TOWARD_X),
                                       GEOMETRY_ARGUMENTS);
     const Vec3 zero = vec3_all((Float)(0.0f));
@@ -42,4 +27,26 @@ kernel void connect_lights(
     put_v(path, PATH_DIRECT_R, add(get_v(path, PATH_DIRECT_R), pick_v(depth == 0u, arrives, zero)));
 #endif
     put_v(path, PATH_LIGHT_R, zero);
+    return count_lanes(wanted);
+}
+
+/// Trace the shadow rays and add what arrives to their paths.
+///
+/// Also paths that have ended may have a last one.
+///
+/// reads   pool.{shadow, toward, light}; geometry
+/// writes  pool.radiance (direct), pool.light (cleared); counters.pending_shadow
+kernel void connect_lights(
+    __global const Params *params,
+    __global float *pool,
+    volatile __global uint *counters,
+    GEOMETRY_PARAMETERS)
+{
+    const uint first = get_global_id(0) * RUN;
+    const uint end = min(first + RUN, params->slots / W);
+    uint wanted = 0;
+    for (uint item = first; item < end; ++item)
+        wanted += connect_paths(params, pool_at(pool, item), GEOMETRY_ARGUMENTS);
+    if (wanted > 0)
+        atomic_add(&counters[COUNTER_PENDING_SHADOW], wanted);
 }

@@ -6,6 +6,22 @@
 #include "common/pool.h"
 #include "common/trace.h"
 
+/// Trace the rays of the W paths of work item `item`; returns how many rays had bounced.
+inline uint trace_paths(__global const Params *params, __global Float *path, GEOMETRY_PARAMETERS)
+{
+    const UInt status = get_u(path, PATH_STATUS);
+    const Mask alive = (status & STATUS_MASK) == STATUS_ALIVE;
+    if (!any_lane(alive))
+        return 0;
+    const Hits hits = closest_hits(params, alive, get_v(path, PATH_ORIGIN_X), get_v(path, PATH_DIRECTION_X),
+                                   GEOMETRY_ARGUMENTS);
+    put_u(path, PATH_HIT_TRIANGLE, hits.triangle);
+    FIELD(path, PATH_HIT_T) = hits.t;
+    FIELD(path, PATH_HIT_U) = hits.u;
+    FIELD(path, PATH_HIT_V) = hits.v;
+    return count_lanes(alive & ((status & DEPTH_MASK) > 0u));
+}
+
 /// Find what the ray of every living path hits.
 ///
 /// reads   pool.{status, origin, direction}; geometry
@@ -16,22 +32,11 @@ kernel void intersect_closest(
     volatile __global uint *counters,
     GEOMETRY_PARAMETERS)
 {
-    const uint item = get_global_id(0);
-    if (item >= params->slots / W)
-        return;
-    __global Float *path = pool_at(pool, item);
-    const UInt status = get_u(path, PATH_STATUS);
-    const Mask alive = (status & STATUS_MASK) == STATUS_ALIVE;
-    if (!any_lane(alive))
-        return;
-    const Mask bounced = alive & ((status & DEPTH_MASK) > 0u);
-    if (any_lane(bounced))
-        atomic_add(&counters[COUNTER_PENDING_BOUNCE], count_lanes(bounced));
-
-    const Hits hits = closest_hits(params, alive, get_v(path, PATH_ORIGIN_X), get_v(path, PATH_DIRECTION_X),
-                                   GEOMETRY_ARGUMENTS);
-    put_u(path, PATH_HIT_TRIANGLE, hits.triangle);
-    FIELD(path, PATH_HIT_T) = hits.t;
-    FIELD(path, PATH_HIT_U) = hits.u;
-    FIELD(path, PATH_HIT_V) = hits.v;
+    const uint first = get_global_id(0) * RUN;
+    const uint end = min(first + RUN, params->slots / W);
+    uint bounced = 0;
+    for (uint item = first; item < end; ++item)
+        bounced += trace_paths(params, pool_at(pool, item), GEOMETRY_ARGUMENTS);
+    if (bounced > 0)
+        atomic_add(&counters[COUNTER_PENDING_BOUNCE], bounced);
 }

@@ -62,7 +62,7 @@ class Plan:
     def declared(self) -> dict[str, Declared]:
         """Return what each kernel declares of its items, by its name."""
         return {
-            kernel.name: kernel.declared(self.traits.lanes)
+            kernel.name: kernel.declared(self.traits)
             for stage in self.stages
             for kernel in stage.kernels
         }

@@ -116,8 +116,7 @@ class Renderer:
     # What happens each bounce, in its order.
 
     def _bounce(self) -> None:
-        items = self.plan.traits.slots // self.plan.traits.lanes
-        for launch in self.bounce_launches:
+        for launch, items in self.bounce_launches:
             launch(items)
 
     def _film(self) -> None:
@@ -464,11 +463,15 @@ class Renderer:
         return programs
 
     def _bind(self, programs: dict[str, Program]) -> None:
-        self.bounce_launches: list[Launch] = [
-            programs[stage.name].bind_planned(kernel, self.buffers)
+        traits = self.plan.traits
+        self.bounce_launches: list[tuple[Launch, int]] = [
+            (
+                programs[stage.name].bind_planned(kernel.name, self.buffers),
+                -(-traits.slots // kernel.paths_per_item(traits)),
+            )
             for stage in self.plan.stages
             if stage.name != "film"
-            for kernel in stage.kernel_names
+            for kernel in stage.kernels
         ]
         self.film_program = programs["film"]
         self.film_launches = [

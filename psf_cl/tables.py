@@ -445,8 +445,8 @@ def environment_cells(environment: Environment) -> np.ndarray:
 def pixel_order(width: int, height: int) -> np.ndarray:
     """Return the pixels of a crop, ``row * width + column``, in the order of the queue.
 
-    Strips of layout.STRIP_ROWS rows, each column by column, as regenerate_paths counts them: the lanes of
-    a block see neighbours.
+    Strips of layout.STRIP_ROWS rows, each column by column, as regenerate_paths counts them: the
+    lanes of a block see neighbours.
 
     Returns:
         ``(width * height,)`` int64.

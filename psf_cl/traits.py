@@ -15,6 +15,8 @@ class DeviceTraits:
         block: paths of one block of the pool; a multiple of ``lanes``.
         slots: paths in flight; a multiple of ``block``.
         group: work items of a work group.
+        run: blocks of lanes that a work item takes one after the other where items would otherwise
+            meet at a counter all the time.
         few_triangles, few_corners: scenes up to this size are traced without a tree, all triangles
             in lanes; 0 for never.
     """
@@ -24,6 +26,7 @@ class DeviceTraits:
     block: int
     slots: int
     group: int
+    run: int = 1
     few_triangles: int = 0
     few_corners: int = 0
 
@@ -48,6 +51,7 @@ class DeviceTraits:
                 block=16,
                 slots=1 << 15,
                 group=8,
+                run=4,
                 few_triangles=160,
                 few_corners=128,
             )

@@ -253,7 +253,7 @@ def accesses(stage):
 
 
 def full_plan():
-    return make_plan(small_scene(), Settings(), AOVS, statistics=True, full=True)
+    return make_plan(small_scene(), Settings(), AOVS, statistics=True, full=True, halves=True)
 
 
 def test_kernels_declare_the_fields_of_a_path_that_their_sources_use():
@@ -344,7 +344,8 @@ def test_repetitions_of_a_real_render_add_up(device, tool):
         assert kernels == planned
         assert one.tally.by_command[TRANSFER, "read counters"].launches > 0
         bounced = one.tally.by_command["intersect", "intersect_closest"]
-        assert bounced.items == bounced.launches * opened.plan.traits.slots
+        paths = opened.plan.declared["intersect_closest"].items
+        assert bounced.items * paths == bounced.launches * opened.plan.traits.slots
         # Clocks of device and host run alike: the parts cannot be more than the whole.
         assert min(one.kernels, one.transfers, one.tally.launching) >= 0.0
         assert one.host >= 0.0

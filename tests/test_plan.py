@@ -106,7 +106,7 @@ def narrow(device):
 
 def bounce_arguments(opened):
     """Return the names of all arguments of the launches of a bounce and of the film."""
-    launches = [*opened.bounce_launches, *(launch for launch, _ in opened.film_launches)]
+    launches = [launch for launch, _ in (*opened.bounce_launches, *opened.film_launches)]
     return {name for launch in launches for name in launch.parameters}
 
 
@@ -118,7 +118,7 @@ def test_no_flag_at_all_leaves_the_least(narrow):
     assert set(opened.buffers) == ALWAYS
     stages = [stage.name for stage in opened.plan.stages]
     assert stages == ["camera", "intersect", "shade", "film"]
-    launched = [launch.name for launch in opened.bounce_launches]
+    launched = [launch.name for launch, _ in opened.bounce_launches]
     assert launched == ["regenerate_paths", "intersect_closest", "shade_paths"]
     left_out = dict(opened.plan.left_out)
     assert left_out["connect"] == "the scene has no light"
@@ -145,7 +145,7 @@ def test_each_flag_alone_brings_its_own_and_renders(narrow, flag):
         nonzero = {n: v for n, v in program.defines.items() if n in opened.plan.features and v}
         assert nonzero.items() <= on.items()
     has_light = flag in (*SKIES, *LIGHTS, "AREA_LIGHTS")
-    assert ("connect_lights" in [launch.name for launch in opened.bounce_launches]) == has_light
+    assert ("connect_lights" in [launch.name for launch, _ in opened.bounce_launches]) == has_light
     opened.render(spp=4)
     image = opened.image()
     assert np.isfinite(image.rgb).all()

@@ -78,7 +78,7 @@ def test_programs_are_built_once_a_set_of_defines(device):
     other = load_program(device, "include_test.cl", {"X": 2}, KERNELS)
     assert other is not first
     traits = device.traits
-    assert other.defines == {"X": 2, "W": traits.lanes, "BLOCK": traits.block}
+    assert other.defines == {"X": 2, "W": traits.lanes, "BLOCK": traits.block, "RUN": traits.run}
 
 
 def test_launches_keep_their_own_arguments(device, fill):

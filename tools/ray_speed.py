@@ -45,7 +45,6 @@ from psf_cl import tables
 from psf_cl.cli.common import positive_integer, size_argument
 from psf_cl.device.device import open_device
 from psf_cl.device.layout import CONSTANT, PATH_FIELDS
-from psf_cl.device.program import Launch
 from psf_cl.errors import DeviceError, InputError
 from psf_cl.scene.model import Scene
 from psf_cl.settings import resolve
@@ -112,14 +111,17 @@ class Ours:
         self.renderer = psf_cl.Renderer(scene, settings, device)
         self.device = device
         self.pool = self.renderer.buffers["pool"]
-        self.launches = {launch.name: launch for launch in self.renderer.bounce_launches}
+        self.launches = {
+            launch.name: (launch, items) for launch, items in self.renderer.bounce_launches
+        }
         self.block = device.traits.block
 
     def run(self, *kernels: str) -> None:
         for name in kernels:
             # A scene without lights has no shadow rays.
             if name in self.launches:
-                self.launches[name](self.device.traits.slots // self.device.traits.lanes)
+                launch, items = self.launches[name]
+                launch(items)
 
     def fields(self) -> np.ndarray:
         """Return the pool, ``(slots, fields)`` float32."""
@@ -150,9 +152,10 @@ class Ours:
     def tracer(self, rays: Rays) -> Callable[[], float]:
         """Return a call that traces ``rays`` and returns the rays per second."""
         name = "connect_lights" if rays.shadow else "intersect_closest"
-        launch: Launch = self.launches[name]
+        launch, all_items = self.launches[name]
         state = _pool_of(rays, self.block)
-        items = len(state) // len(PATH_FIELDS) // self.device.traits.lanes
+        paths = len(state) // len(PATH_FIELDS)
+        items = -(-paths * all_items // self.device.traits.slots)
 
         def trace() -> float:
             self.device.write(self.pool, state)

@@ -1,8 +1,8 @@
 // What a scene may need: each is defined by the plan, also when it is 0.
 #pragma once
 
-#if !defined(W) || !defined(BLOCK)
-#error "W and BLOCK must be defined"
+#if !defined(W) || !defined(BLOCK) || !defined(RUN)
+#error "W, BLOCK and RUN must be defined"
 #endif
 #ifndef TEXTURES
 #error "TEXTURES must be 0 or 1"

@@ -156,7 +156,7 @@ def load_program(
     The lane width and the block of the pool are defined for every program.
     """
     traits = device.traits
-    values = {"W": traits.lanes, "BLOCK": traits.block} | {
+    values = {"W": traits.lanes, "BLOCK": traits.block, "RUN": traits.run} | {
         name: int(value) for name, value in (defines or {}).items()
     }
     key = (file, folder, tuple(sorted(values.items())))

@@ -32,6 +32,7 @@ def plan(context: Context) -> StageSpec:
         writes=(*started, *named),
         # An entry of the order of pixels, and a weighted sample a plane.
         record_bytes=4 + 16 * (1 + len(direct)),
+        runs=True,
     )
     return StageSpec(
         "camera",

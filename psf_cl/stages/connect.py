@@ -15,6 +15,7 @@ def plan(context: Context) -> StageSpec | None:
         reads=("light", "shadow", "toward", "radiance", *direct),
         writes=("light", "radiance", *direct[:1]),
         rays=("shadow",),
+        runs=True,
     )
     return StageSpec(
         "connect",

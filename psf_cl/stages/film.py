@@ -34,14 +34,12 @@ def plan(context: Context) -> StageSpec:
     # A weighted value; the sums are read and written.
     sample_bytes = planes * (16 + 2 * dtype.itemsize)
     kernels = [
-        KernelSpec("add_samples", record_bytes=sample_bytes, per_sample=True, lanes=False),
+        KernelSpec("add_samples", record_bytes=sample_bytes, per_sample=True),
         KernelSpec("advance_film", lanes=False),
     ]
     if context.halves:
         half_bytes = 16 + dtype.itemsize  # Half of the samples are added.
-        kernels.append(
-            KernelSpec("add_half", record_bytes=half_bytes, per_sample=True, lanes=False)
-        )
+        kernels.append(KernelSpec("add_half", record_bytes=half_bytes, per_sample=True))
         what = "sums of half of the passes, to estimate the error"
         buffers.append(BufferSpec("film_half", dtype, context.pixel_count, what))
     if context.statistics:

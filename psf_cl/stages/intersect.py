@@ -12,6 +12,7 @@ def plan(context: Context) -> StageSpec:
         reads=("status", "origin", "direction"),
         writes=("hit",),
         rays=("camera", "bounce"),
+        runs=True,
     )
     return StageSpec(
         "intersect",

@@ -35,6 +35,7 @@ class KernelSpec:
         record_bytes: read and written outside of it: records of tables, samples, film.
         per_sample: whether ``record_bytes`` are those of each sample of the render instead.
         lanes: whether a work item computes as many items as the device has lanes.
+        runs: whether a work item takes as many blocks of lanes as the device's ``run`` says.
         rays: kinds of rays that it traces (camera, bounce, shadow).
         hash_accesses: look-ups and insertions.
     """
@@ -45,14 +46,19 @@ class KernelSpec:
     record_bytes: int = 0
     per_sample: bool = False
     lanes: bool = True
+    runs: bool = False
     rays: tuple[str, ...] = ()
     hash_accesses: int = 0
 
-    def declared(self, lanes: int) -> Declared:
-        """Return what its rates are computed from, for work items of ``lanes`` paths."""
+    def paths_per_item(self, traits: DeviceTraits) -> int:
+        """Return how many paths, pixels or the like a work item computes."""
+        return (traits.lanes if self.lanes else 1) * (traits.run if self.runs else 1)
+
+    def declared(self, traits: DeviceTraits) -> Declared:
+        """Return what its rates are computed from on a device of these traits."""
         words = len(path_fields(*self.reads)) + len(path_fields(*self.writes))
         return Declared(
-            items=lanes if self.lanes else 1,
+            items=self.paths_per_item(traits),
             bytes=4 * words + self.record_bytes,
             per_sample=self.per_sample,
             rays=self.rays,
