@@ -343,7 +343,7 @@ def _scene_buffers(context: Context, scene: Scene) -> tuple[BufferSpec, ...]:
         block, node = layout.TRIANGLE_BLOCK.dtype, layout.BVH_NODE.dtype
         buffers += [
             BufferSpec("blocks", block, -(-triangles // 2), "leaves (estimate)"),
-            BufferSpec("nodes", node, -(-triangles // 6), "inner nodes (estimate)"),
+            BufferSpec("nodes", node, -(-triangles // 12), "inner nodes (estimate)"),
         ]
     if context.on("SMOOTH"):
         buffers.append(BufferSpec("normals", layout.NORMALS.dtype, triangles, "shading normals"))

@@ -37,7 +37,7 @@ def direction(cosine, phi=0.4):
 
 def run(device, kernel, inputs, outputs, transmission=1):
     inputs = {name: np.ascontiguousarray(v, np.float32) for name, v in inputs.items()}
-    defines = {"TRANSMISSION": transmission}
+    defines = {"GLOSSY": 1, "TRANSMISSION": transmission}
     return planes.run(device, "bsdf_test.cl", kernel, inputs, outputs, defines)
 
 

@@ -19,7 +19,7 @@ from scene_builder import (
     renderer,
 )
 
-from psf_cl.device.device import open_device
+from psf_cl.device.device import Device, open_device
 from psf_cl.device.program import assemble, load_program
 from psf_cl.device.sources import kernel_folder
 from psf_cl.errors import InputError
@@ -35,7 +35,7 @@ LIFTED = transform.translation((0, 0.5, 0)) @ transform.scaling(0.3)
 LOW = transform.translation((0, 0.2, 0))
 FLAT_QUAD = primitives.quad()
 
-#: What a flag of the plan needs: shapes, lights, a sky, a lens or an AOV.
+#: What a flag of the plan needs: shapes, lights, a sky, a lens, an AOV or a device that wants it.
 PARTS = {
     "TEXTURES": (FLAT_QUAD, LIFTED, lambertian(0.5, base_color_texture=0)),
     "ALPHA": (
@@ -43,7 +43,8 @@ PARTS = {
         LOW,
         lambertian(0.5, base_color_texture=0, alpha=0.2, alpha_mode="mask"),
     ),
-    "SMOOTH": (primitives.sphere(8, 6), LIFTED, lambertian(0.5)),
+    "SMOOTH": (primitives.sphere(5, 4), LIFTED, lambertian(0.5)),
+    "GLOSSY": (FLAT_QUAD, LIFTED, Material()),
     "TRANSMISSION": (primitives.box(), LIFTED, Material(transmission=1.0, roughness=0.3)),
     "AREA_LIGHTS": (inside_out(FLAT_QUAD), LIFTED, glowing(3.0)),
 }
@@ -53,12 +54,14 @@ SKIES = {
     "ENVIRONMENT image": Environment((1.0, 1.0, 1.0), np.ones((2, 4, 3), np.float32)),
 }
 OUTPUTS = {"AOV_DIRECT": "direct", "AOV_FEATURES": "albedo"}
-CHOICES = [*PARTS, *LIGHTS, *SKIES, "LENS", *OUTPUTS]
+CHOICES = [*PARTS, *LIGHTS, *SKIES, "LENS", *OUTPUTS, "FEW"]
 
 ALWAYS = {
-    *("params", "blocks", "nodes", "surfaces", "materials"),
+    *("params", "surfaces", "materials"),
     *("pool", "counters", "samples", "film"),
 }
+TREE = {"nodes", "blocks"}
+LIST = {"corners", "faces"}
 TEXTURE_BUFFERS = {"uvs", "textures", "texels", "srgb_to_linear"}
 NEEDED = {
     "TEXTURES": TEXTURE_BUFFERS,
@@ -74,7 +77,10 @@ NEEDED = {
 
 
 def with_flags(*flags):
-    """Return a scene that needs these flags and no other, and the outputs to ask for."""
+    """Return a scene that needs these flags and no other, and the outputs to ask for.
+
+    It is small enough for a list of triangles; whether it gets one is the device's choice.
+    """
     lens = {"lens_radius": 0.05, "focus_distance": 3.0} if "LENS" in flags else {}
     sky = next((SKIES[flag] for flag in flags if flag in SKIES), Environment())
     scene = build(
@@ -91,6 +97,10 @@ def with_flags(*flags):
 def values_of(flags):
     """Return the macros that are not 0 for these flags."""
     values = {flag.split()[0]: 2 if flag.endswith("image") else 1 for flag in flags}
+    if "FEW" in values:
+        values["FEW"] = 32
+    if "TRANSMISSION" in values:
+        values["GLOSSY"] = 1
     if "ALPHA" in values:
         values["TEXTURES"] = 1
     if values.keys() & {"AREA_LIGHTS", "PUNCTUAL_LIGHTS", "ENVIRONMENT"}:
@@ -98,10 +108,29 @@ def values_of(flags):
     return values
 
 
+def buffers_of(flags):
+    """Return the names of the buffers that these flags bring."""
+    tree = LIST if "FEW" in flags else TREE
+    return (ALWAYS | tree).union(*(NEEDED.get(flag, set()) for flag in flags))
+
+
+def few(device):
+    """Return the same device, but small scenes get a list of triangles in place of a tree."""
+    return Device(device.context, replace(device.traits, few_triangles=160, few_corners=128))
+
+
 @pytest.fixture(scope="module")
 def narrow(device):
-    """Open a device with one lane: its programs are the quickest to build."""
-    return open_device(traits=replace(device.traits, lanes=1, block=8, slots=64))
+    """Open a device with one lane, whose programs are the quickest to build, and trees for all."""
+    traits = replace(device.traits, lanes=1, block=8, slots=64, few_triangles=0, few_corners=0)
+    return open_device(traits=traits)
+
+
+@pytest.fixture(scope="module")
+def wants(narrow):
+    """Return the narrow device that ``flags`` want."""
+    listed = few(narrow)
+    return lambda flags: listed if "FEW" in flags else narrow
 
 
 def bounce_arguments(opened):
@@ -115,7 +144,7 @@ def test_no_flag_at_all_leaves_the_least(narrow):
     narrow.programs.clear()
     opened = renderer(narrow, scene)
     assert not any(feature.value for feature in opened.plan.features.values())
-    assert set(opened.buffers) == ALWAYS
+    assert set(opened.buffers) == buffers_of(())
     stages = [stage.name for stage in opened.plan.stages]
     assert stages == ["camera", "intersect", "shade", "film"]
     launched = [launch.name for launch, _ in opened.bounce_launches]
@@ -132,16 +161,17 @@ def test_no_flag_at_all_leaves_the_least(narrow):
 
 
 @pytest.mark.parametrize("flag", CHOICES)
-def test_each_flag_alone_brings_its_own_and_renders(narrow, flag):
+def test_each_flag_alone_brings_its_own_and_renders(wants, flag):
     scene, outputs = with_flags(flag)
-    narrow.programs.clear()
-    opened = renderer(narrow, scene, outputs)
+    device = wants([flag])
+    device.programs.clear()
+    opened = renderer(device, scene, outputs)
     on = {name: f.value for name, f in opened.plan.features.items() if f.value}
     assert on == values_of([flag])
-    expected = ALWAYS | NEEDED.get(flag, set())
+    expected = buffers_of([flag])
     assert set(opened.buffers) == expected
     assert bounce_arguments(opened) - {"film", "planes", "partial"} <= expected
-    for program in narrow.programs.values():
+    for program in device.programs.values():
         nonzero = {n: v for n, v in program.defines.items() if n in opened.plan.features and v}
         assert nonzero.items() <= on.items()
     has_light = flag in (*SKIES, *LIGHTS, "AREA_LIGHTS")
@@ -208,10 +238,10 @@ def test_lights_are_sampled_only_where_the_settings_do(narrow, settings, flag, p
     opened.close()
 
 
-def test_every_flag_at_once_renders(narrow):
+def test_every_flag_at_once_renders(wants):
     flags = [flag for flag in CHOICES if flag != "ENVIRONMENT"]
     scene, _ = with_flags(*flags)
-    opened = renderer(narrow, scene, AOVS)
+    opened = renderer(wants(flags), scene, AOVS)
     assert all(feature.value for feature in opened.plan.features.values())
     assert opened.plan.left_out == ()
     opened.render(spp=4)
@@ -227,13 +257,13 @@ def pairs():
     return [(a, b) for a, b in pairs if a.split()[0] != b.split()[0]]
 
 
-def test_planned_bytes_are_those_that_are_allocated(narrow):
+def test_planned_bytes_are_those_that_are_allocated(wants):
     for flags in [(), *((flag,) for flag in CHOICES), tuple(CHOICES[:5]), tuple(CHOICES[5:])]:
         scene, outputs = with_flags(*flags)
-        opened = renderer(narrow, scene, outputs)
+        opened = renderer(wants(flags), scene, outputs)
         planned = {buffer.name: buffer.bytes for buffer in opened.plan.buffers}
         allocated = {name: buffer.bytes for name, buffer in opened.buffers.items()}
-        for estimate in ("nodes", "blocks"):
+        for estimate in TREE & planned.keys():
             del planned[estimate], allocated[estimate]
         assert planned == allocated, flags
         opened.close()
@@ -249,20 +279,19 @@ def test_estimates_of_the_hierarchy_are_of_the_right_size(narrow):
     opened.close()
 
 
-def test_plans_of_pairs_of_flags_hold_both_and_no_other(device):
+def test_plans_of_pairs_of_flags_hold_both_and_no_other(wants):
     for pair in pairs():
         scene, outputs = with_flags(*pair)
-        plan = make_plan(scene, Settings(), outputs, device.traits)
+        plan = make_plan(scene, Settings(), outputs, wants(pair).traits)
         assert {n: f.value for n, f in plan.features.items() if f.value} == values_of(pair)
-        expected = ALWAYS.union(*(NEEDED.get(flag, set()) for flag in pair))
-        assert {buffer.name for buffer in plan.buffers} == expected
+        assert {buffer.name for buffer in plan.buffers} == buffers_of(pair)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pair", pairs(), ids=" ".join)
-def test_pairs_of_flags_build(narrow, pair):
+def test_pairs_of_flags_build(narrow, wants, pair):
     scene, outputs = with_flags(*pair)
-    plan = make_plan(scene, Settings(), outputs, narrow.traits)
+    plan = make_plan(scene, Settings(), outputs, wants(pair).traits)
     for stage in plan.stages:
         stack = {"STACK_SIZE": 16} if stage.traces else {}
         load_program(narrow, stage.source, plan.defines(stage) | stack)
@@ -297,7 +326,7 @@ def test_unused_materials_and_black_lights_bring_nothing():
         environment=Environment((0.0, 0.0, 0.0), np.ones((2, 4, 3), np.float32)),
     )
     plan = make_plan(scene, Settings())
-    assert {n for n, f in plan.features.items() if f.value} == {"AREA_LIGHTS", "CONNECT"}
+    assert {n for n, f in plan.features.items() if f.value} == {"AREA_LIGHTS", "CONNECT", "FEW"}
 
 
 @pytest.mark.parametrize("crop", [(0, 0, 9, 8), (-1, 0, 4, 4), (0, 0, 0, 4), (7, 7, 2, 1)])
