@@ -4,13 +4,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rays import (
+    NO_HIT,
+    all_hits,
+    check_against_brute_force,
+    closed_sphere,
+    make_rays,
+    rays_at_edges,
+    rays_through,
+    soup,
+)
 
 from psf_cl.device.bvh import Refit, build_bvh, visit_cost
 from psf_cl.device.layout import CONSTANT
 from psf_cl.device.program import load_program
 
 KERNELS = Path(__file__).parent / "kernels"
-NO_HIT = CONSTANT["NO_HIT"]
 LEAF_BIT = CONSTANT["LEAF_BIT"]
 ALPHA_BIT = CONSTANT["ALPHA_BIT"]
 
@@ -94,70 +103,6 @@ def traced(device):
     yield build
     for item in made:
         item.release()
-
-
-def soup(count, seed=0, size=0.3):
-    rng = np.random.default_rng(seed)
-    centers = rng.uniform(-1, 1, (count, 1, 3))
-    return (centers + size * rng.normal(size=(count, 3, 3))).astype(np.float32)
-
-
-def make_rays(origins, directions, t_max=np.inf):
-    origins, directions = np.broadcast_arrays(origins, directions)
-    ends = np.broadcast_to(np.float32(t_max), (len(origins),))[:, None]
-    return np.concatenate([origins, directions, ends], axis=1).astype(np.float32)
-
-
-def rays_through(count, seed=1, scale=1.0):
-    """Rays from all around toward points near the origin."""
-    rng = np.random.default_rng(seed)
-    origins = rng.uniform(-2, 2, (count, 3))
-    targets = rng.uniform(-1, 1, (count, 3))
-    return make_rays(scale * origins, scale * (targets - origins))
-
-
-def all_hits(triangles, rays):
-    """Return t, u, v of every ray with every triangle in float64, and how near the edge it passes.
-
-    Where there is no hit, t is inf.
-
-    Source: Moeller, Trumbore, "Fast, Minimum Storage Ray-Triangle Intersection", 1997.
-    """
-    p = triangles.astype(np.float64)
-    origin, direction, t_max = np.split(rays.astype(np.float64)[:, None], [3, 6], axis=2)
-    e1, e2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
-    with np.errstate(all="ignore"):
-        q = np.cross(direction, e2)
-        inverse = 1.0 / np.sum(q * e1, axis=2)
-        from_corner = origin - p[:, 0]
-        u = np.sum(from_corner * q, axis=2) * inverse
-        r = np.cross(from_corner, e1)
-        v = np.sum(direction * r, axis=2) * inverse
-        t = np.sum(e2 * r, axis=2) * inverse
-        inside = np.minimum(np.minimum(u, v), 1.0 - u - v)
-        hit = (inside >= 0) & (t > 0) & (t < t_max[:, :, 0]) & np.isfinite(inside)
-        margin = np.where(t > 0, np.abs(inside), np.inf)
-    return np.where(hit, t, np.inf), u, v, np.where(np.isfinite(margin), margin, np.inf)
-
-
-def check_against_brute_force(traced_soup, rays, margin=1e-4):
-    """Compare every ray that passes no edge within ``margin`` (barycentric)."""
-    found, distances = traced_soup.closest(rays)
-    blocked = traced_soup.any(rays)
-    clear = np.ones(len(rays), bool)
-    expected_t = np.full(len(rays), np.inf)
-    expected = np.full(len(rays), NO_HIT, np.uint32)
-    if len(traced_soup.triangles):
-        t, _, _, edge = all_hits(traced_soup.triangles, rays)
-        clear = edge.min(axis=1) > margin
-        expected_t = t.min(axis=1)
-        expected = np.where(np.isfinite(expected_t), t.argmin(axis=1), NO_HIT)
-    assert clear.mean() > 0.5
-    np.testing.assert_array_equal(found[clear], expected[clear])
-    np.testing.assert_array_equal(blocked[clear], expected[clear] != NO_HIT)
-    hit = clear & (expected != NO_HIT)
-    np.testing.assert_allclose(distances[hit, 0], expected_t[hit], rtol=1e-4, atol=1e-6)
-    return found, distances
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 4, 5, 17, 1000])
@@ -530,50 +475,6 @@ def test_a_far_corner_leaves_the_rest_of_the_scene_right(traced):
     same = found != 500
     assert same.mean() > 0.9
     np.testing.assert_array_equal(found[same], moved[same])
-
-
-def closed_sphere(rings, segments):
-    """Return corners ``(n, 3)`` and faces of a lumpy, closed sphere around the origin."""
-    theta = np.pi * np.arange(1, rings) / rings
-    phi = 2 * np.pi * np.arange(segments) / segments
-    theta, phi = (a.ravel() for a in np.meshgrid(theta, phi, indexing="ij"))
-    radius = 1 + 0.2 * np.sin(5 * theta) * np.cos(3 * phi) + 0.05 * np.sin(17 * phi + 9 * theta)
-    directions = np.stack(
-        [np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], axis=1
-    )
-    points = np.concatenate([directions * radius[:, None], [[0, 1, 0], [0, -1, 0]]])
-    ring, segment = np.divmod(np.arange((rings - 2) * segments), segments)
-    a = ring * segments + segment
-    b = ring * segments + (segment + 1) % segments
-    c, d = a + segments, b + segments
-    top, bottom = len(points) - 2, len(points) - 1
-    rim, following = np.arange(segments), (np.arange(segments) + 1) % segments
-    last = (rings - 2) * segments
-    faces = np.concatenate(
-        [
-            np.stack([a, b, c], axis=1),
-            np.stack([b, d, c], axis=1),
-            np.stack([np.full(segments, top), following, rim], axis=1),
-            np.stack([np.full(segments, bottom), last + rim, last + following], axis=1),
-        ]
-    )
-    return points, faces
-
-
-def rays_at_edges(points, faces, origins, seed):
-    """Aim at corners and at points of edges, a third of them the middles."""
-    rng = np.random.default_rng(seed)
-    count = len(origins)
-    corners = points[faces[rng.integers(0, len(faces), count)]]
-    first = rng.integers(0, 3, count)
-    a = corners[np.arange(count), first]
-    b = corners[np.arange(count), (first + 1) % 3]
-    part = np.select(
-        [np.arange(count) % 3 == 0, np.arange(count) % 3 == 1],
-        [np.zeros(count), np.full(count, 0.5)],
-        rng.random(count),
-    ).astype(np.float32)
-    return make_rays(origins, a + part[:, None] * (b - a) - origins)
 
 
 def count_misses(tree, points, faces, ray_count, center, scale):
