@@ -1,6 +1,7 @@
 """The BSDF: formulas against doubles, sampling against its density, energy, reciprocity."""
 
 from functools import cache
+from itertools import pairwise
 
 import bsdf_truth as truth
 import numpy as np
@@ -35,25 +36,25 @@ def direction(cosine, phi=0.4):
     return np.array([sine * np.cos(phi), sine * np.sin(phi), cosine])
 
 
-def run(device, kernel, inputs, outputs, transmission=1):
+def run(device, kernel, inputs, outputs, transmission=1, glossy=1):
     inputs = {name: np.ascontiguousarray(v, np.float32) for name, v in inputs.items()}
-    defines = {"GLOSSY": 1, "TRANSMISSION": transmission}
+    defines = {"GLOSSY": glossy, "TRANSMISSION": transmission}
     return planes.run(device, "bsdf_test.cl", kernel, inputs, outputs, defines)
 
 
-def sample(device, records, given, wo, numbers, transmission=1):
+def sample(device, records, given, wo, numbers, *build):
     """Return directions and values ``(n, 3)`` and densities ``(n,)``; all arguments ``(n, k)``."""
     wi, values, pdfs = run(
         device,
         "sample_directions",
         {"materials": records.T, "given": given.T, "wo": wo.T, "numbers": numbers.T},
         {"wi": (np.float32, 3), "values": (np.float32, 3), "pdfs": (np.float32, 1)},
-        transmission,
+        *build,
     )
     return wi.T, values.T, pdfs
 
 
-def evaluate(device, records, given, wo, wi, side=None, transmission=1):
+def evaluate(device, records, given, wo, wi, side=None, build=()):
     """Return values ``(n, 3)`` and densities ``(n,)``."""
     side = wi[:, 2] if side is None else side
     values, pdfs = run(
@@ -61,15 +62,21 @@ def evaluate(device, records, given, wo, wi, side=None, transmission=1):
         "eval_pairs",
         {"materials": records.T, "given": given.T, "wo": wo.T, "wi": wi.T, "side": side},
         {"values": (np.float32, 3), "pdfs": (np.float32, 1)},
-        transmission,
+        *build,
     )
     return values.T, pdfs
 
 
-def chances(device, records, wo, transmission=1):
+def chances(device, records, wo, *build):
     """Return the chances to reflect, refract and scatter, ``(n, 3)``."""
     inputs = {"materials": records.T, "wo": wo.T}
-    return run(device, "list_chances", inputs, {"chances": (np.float32, 3)}, transmission)[0].T
+    return run(device, "list_chances", inputs, {"chances": (np.float32, 3)}, *build)[0].T
+
+
+def left_of_choice(device, records, wo, numbers, *build):
+    """Return what is left of the numbers ``(n,)`` that choose a lobe."""
+    inputs = {"materials": records.T, "wo": wo.T, "numbers": numbers}
+    return run(device, "list_left_of_choice", inputs, {"left": (np.float32, 1)}, *build)[0]
 
 
 def cases_in_turn(cases, count, seed):
@@ -129,7 +136,7 @@ def test_values_and_densities_equal_the_papers(lane_device, opaque):
     drawn, _, _ = sample(lane_device, records, by_chance, wo, numbers, build)
     use = (np.arange(count) % 2 == 0) & (drawn[:, 2] != 0)
     wi[use] = drawn[use]
-    values, pdfs = evaluate(lane_device, records, by_chance, wo, wi, transmission=build)
+    values, pdfs = evaluate(lane_device, records, by_chance, wo, wi, build=(build,))
     chance = chances(lane_device, records, wo, build)
 
     o, i = wo.astype(np.float64), wi.astype(np.float64)
@@ -332,6 +339,54 @@ def test_albedo_of_a_coat_is_what_it_reflects(roughness, ior):
     cosines = np.sqrt((np.arange(20000) + 0.5) / 20000)
     average = truth.coat_albedo(coat, cosines).mean()
     assert abs(truth.average_coat_albedo(coat) - average) < 3e-4
+
+
+def test_what_is_left_of_the_choice_of_a_lobe_is_uniform(lane_device):
+    """In each lobe apart: roulette must not know which lobe was chosen."""
+    count = 40_000
+    fogged = Bsdf(roughness=0.6, transmission=0.5, metallic=0.2)
+    for bsdf in (*(MATERIALS[name] for name in ("lambert", "plastic", "metal", "glass")), fogged):
+        records = np.tile(bsdf.record(), (count, 1))
+        wo = np.tile(direction(0.6), (count, 1))
+        numbers = np.arange(count) / count
+        left = left_of_choice(lane_device, records, wo, numbers).astype(np.float64)
+        assert left.min() >= 0 and left.max() < 1
+        reflect, refract, diffuse = chances(lane_device, records[:1], wo[:1])[0].astype(np.float64)
+        # sample_bsdf takes the diffuse lobe first, then reflection.
+        ends = np.cumsum([0, diffuse, reflect, refract])
+        for low, high in pairwise(ends):
+            inside = (numbers > low + 1e-6) & (numbers < high - 1e-6)
+            if high - low > 1e-3:
+                expected = (numbers[inside] - low) / (high - low)
+                # A rounding of the number, stretched by the inverse of the chance.
+                np.testing.assert_allclose(left[inside], expected, atol=3e-7 / (high - low))
+
+
+def test_a_build_without_gloss_is_the_full_one_for_matt_materials(lane_device):
+    count = 4000
+    rng = np.random.default_rng(14)
+    colors = rng.random((count, 3))
+    bsdfs = [Bsdf(base_color=tuple(c), specular=0.0, roughness=rng.random()) for c in colors]
+    records = np.array([b.record() for b in bsdfs])
+    given = np.full((count, 3), -1.0)
+    _, wo, wi = random_pairs(count, 15)
+    matt, full = (0, 0), (1, 1)
+    assert (chances(lane_device, records, wo, *matt) == [0, 0, 1]).all()
+    for side in (None, -wi[:, 2]):
+        values, pdfs = evaluate(lane_device, records, given, wo, wi, side, matt)
+        expected, expected_pdfs = evaluate(lane_device, records, given, wo, wi, side, full)
+        np.testing.assert_allclose(values, expected, rtol=2e-6)
+        np.testing.assert_allclose(pdfs, expected_pdfs, rtol=1e-6)
+    above = np.clip(wi[:, 2:], 0, None).astype(np.float64)
+    values, pdfs = evaluate(lane_device, records, given, wo, wi, build=matt)
+    np.testing.assert_allclose(values, records[:, :3] * above / np.pi, rtol=1e-6)
+    np.testing.assert_allclose(pdfs[:, None], above / np.pi, rtol=1e-6)
+    numbers = rng.integers(0, 1 << 24, (count, 3)) / 2.0**24
+    one, other = (sample(lane_device, records, given, wo, numbers, *b) for b in (matt, full))
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_allclose(a, b, rtol=2e-6)
+    one, other = (left_of_choice(lane_device, records, wo, numbers[:, 0], *b) for b in (matt, full))
+    np.testing.assert_array_equal(one, other)
 
 
 def test_weights_stay_finite_at_the_extremes(lane_device):

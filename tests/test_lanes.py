@@ -53,6 +53,33 @@ def test_vectors_of_every_length_become_unit(lane_device, size):
     np.testing.assert_allclose(unit, expected, rtol=0, atol=3e-7)
 
 
+def test_neighbours_of_very_different_length_become_unit(lane_device):
+    rng = np.random.default_rng(6)
+    v = rng.normal(size=(3, 20000))
+    # Each vector, and each component of half of them, of its own order of magnitude; none vanishes.
+    v *= 2.0 ** rng.uniform(-80, 120, 20000)
+    v[:, ::2] *= 2.0 ** rng.uniform(-40, 0, (3, 10000))
+    v = v.astype(np.float32)
+    # Of the first work items all lanes are of usual length: nothing to scale.
+    v[:, :64] = rng.normal(size=(3, 64))
+    (unit,) = run(lane_device, "normalize_vectors", {"v": v}, {"units": (np.float32, 3)})
+    exact = v.astype(np.float64)
+    np.testing.assert_allclose(unit, exact / np.linalg.norm(exact, axis=0), rtol=0, atol=3e-7)
+
+
+@pytest.mark.parametrize("error", [0.0, 1e-6, 1e-4])
+def test_lengths_that_rounding_changed_become_one(lane_device, error):
+    rng = np.random.default_rng(7)
+    v = rng.normal(size=(3, 4096))
+    v *= (1 + error * rng.uniform(-1, 1, 4096)) / np.linalg.norm(v, axis=0)
+    v = v.astype(np.float32)
+    (unit,) = run(lane_device, "renormalize_vectors", {"v": v}, {"units": (np.float32, 3)})
+    exact = v.astype(np.float64)
+    # Newton's step leaves 3/2 of the square of the error, and its own roundings.
+    atol = 2e-7 + 1.5 * error**2
+    np.testing.assert_allclose(unit, exact / np.linalg.norm(exact, axis=0), rtol=0, atol=atol)
+
+
 def test_vectors_without_direction_become_the_z_axis(lane_device):
     inf, subnormal = np.inf, 1e-41
     v = np.array(
@@ -117,19 +144,49 @@ def test_masks_count_rank_and_pick(lane_device):
     np.testing.assert_array_equal(vectors, [picked, swapped, picked])
 
 
+def masks(lanes):
+    """Return flags of whole work items: no lane, all, each single one, and at random."""
+    rng = np.random.default_rng(8)
+    blocks = [np.zeros(16), np.ones(16), *np.eye(16), *(rng.random((300, 16)) < 0.5)]
+    flags = np.concatenate(blocks).astype(np.uint32)
+    return flags, (flags != 0).reshape(-1, lanes)
+
+
+def test_bits_of_a_mask_are_its_lanes_and_lead_back(lane_device):
+    lanes = lane_device.traits.lanes
+    flags, on = masks(lanes)
+    outputs = {"bits": (np.uint32, 1), "back": (np.uint32, 1)}
+    bits, back = run(lane_device, "mask_bits", {"flags": flags}, outputs)
+    expected = (on << np.arange(lanes)).sum(axis=1, keepdims=True)
+    np.testing.assert_array_equal(bits.reshape(-1, lanes), np.broadcast_to(expected, on.shape))
+    np.testing.assert_array_equal(back, flags)
+
+
+def test_least_of_all_lanes(lane_device):
+    lanes = lane_device.traits.lanes
+    x = np.random.default_rng(9).normal(size=4096).astype(np.float32)
+    # The least in each lane once, an infinite one, one of its own sign.
+    x[: 16 * 16].reshape(16, 16)[np.arange(16), np.arange(16)] = -10
+    x[512], x[600], x[640:672] = -np.inf, np.inf, np.abs(x[640:672])
+    (least,) = run(lane_device, "least_of", {"x": x}, {"least": (np.float32, 1)})
+    expected = np.repeat(x.reshape(-1, lanes).min(axis=1), lanes)
+    np.testing.assert_array_equal(least, expected)
+
+
 def test_gathers_read_every_lane_of_its_own_index(lane_device):
     rng = np.random.default_rng(5)
     table = rng.integers(0, 2**32, (1000, 2), np.uint32)
     table[:, 0] = rng.normal(size=1000).astype(np.float32).view(np.uint32)
     indices = rng.integers(0, 1000, 4096, np.uint32)
     buffer = lane_device.upload("entries", table.view(np.float32))
-    values, numbers = run(
+    values, numbers, words = run(
         lane_device,
         "gather_entries",
         {"indices": indices},
-        {"values": (np.float32, 1), "numbers": (np.uint32, 1)},
+        {"values": (np.float32, 1), "numbers": (np.uint32, 1), "words": (np.uint32, 1)},
         entries=buffer,
     )
     lane_device.release(buffer)
     np.testing.assert_array_equal(values.view(np.uint32), table[indices, 0])
     np.testing.assert_array_equal(numbers, table[indices, 1])
+    np.testing.assert_array_equal(words, table.ravel()[indices])

@@ -369,6 +369,31 @@ def test_dead_lanes_and_lights_of_every_kind_stay_apart(lit):
     np.testing.assert_allclose(radiance[sky], 0.5, rtol=1e-6)
 
 
+@pytest.mark.parametrize("count", [1, 3, 7, 64, 1000, 1_000_003])
+def test_slots_are_uniform_and_so_is_what_is_left_in_each(lane_device, count):
+    bits = np.random.default_rng(count).integers(0, 2**32, 200_000, np.uint32)
+    bits[:2] = 0, 2**32 - 1
+    slots, left = planes.run(
+        lane_device,
+        "light_test.cl",
+        "list_slots",
+        {"bits": bits},
+        {"slots": (np.uint32, 1), "left": (np.float32, 1)},
+        {"AREA_LIGHTS": 0, "PUNCTUAL_LIGHTS": 0, "ENVIRONMENT": 0, "TEXTURES": 0},
+        count=count,
+    )
+    product = bits.astype(np.uint64) * count
+    np.testing.assert_array_equal(slots, product >> np.uint64(32))
+    expected = (product & np.uint64(2**32 - 1)) / 2.0**32
+    assert left.min() >= 0 and left.max() < 1
+    np.testing.assert_allclose(left, expected, rtol=0, atol=2.0**-24)
+    # Bins of slots by bins of what is left.
+    at = (slots.astype(np.int64) * min(count, 16) // count) * 16 + (left * 16).astype(int)
+    share = np.bincount(np.arange(count) * min(count, 16) // count) / count / 16
+    expected = np.repeat(share, 16) * len(bits)
+    assert stats.chisquare(np.bincount(at, minlength=len(expected)), expected).pvalue > P_MIN
+
+
 def test_weights_of_two_samplers_are_the_power_heuristic(lane_device):
     a = np.array([1, 0, 3, 1e-20, 1e25, 1e30, 5, 0.1, 1e38], np.float32)
     b = np.array([1, 2, 0, 1e-20, 1e-5, 1e30, 1, 0.3, 1e-38], np.float32)

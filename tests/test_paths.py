@@ -409,9 +409,12 @@ def varied_reference(device):
         {"direct_sampling": "light", "light_sampling": "uniform"},
         {"direct_sampling": "bsdf"},
         {"termination": "off"},
+        {"termination": "off", "sampler": "sobol"},
+        {"roulette_depth": 0},
+        {"roulette_depth": 0, "sampler": "sobol"},
         {"sampler": "sobol"},
     ],
-    ids=lambda settings: " ".join(settings.values()),
+    ids=lambda settings: " ".join(f"{value}" for value in settings.values()),
 )
 def test_estimators_agree_within_their_confidence_intervals(device, varied_reference, settings):
     image = render(device, varied_scene(), 1024, ["variance"], seed=2, **(VARIED | settings))

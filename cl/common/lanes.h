@@ -52,6 +52,8 @@ inline int any_lane(int mask) { return mask != 0; }
 inline uint count_lanes(int mask) { return mask != 0; }
 inline uint lanes_before(int mask) { return 0; }
 inline uint lane_bits(int mask) { return mask != 0; }
+inline int lanes_of(uint bits) { return bits & 1u; }
+inline float least_lane(float x) { return x; }
 inline float to_float(uint x) { return (float)x; }
 inline uint to_uint(float x) { return (uint)x; }
 inline uint as_bits(float x) { return as_uint(x); }

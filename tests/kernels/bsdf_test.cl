@@ -10,10 +10,12 @@ static inline Bsdf load_bsdf(global const float *materials)
 {
     Bsdf b;
     b.base_color = LOAD_V(materials, 0);
+#if GLOSSY
     b.metallic = LOAD(materials, 3);
     b.alpha = LOAD(materials, 4);
     b.f0 = LOAD(materials, 5);
     b.specular = LOAD(materials, 6);
+#endif
 #if TRANSMISSION
     b.transmission = LOAD(materials, 7);
     b.eta = LOAD(materials, 8);
@@ -25,7 +27,9 @@ static inline LobeChances load_chances(global const float *chances, Bsdf b, Floa
 {
     LobeChances c = lobe_chances(b, cos_o);
     const Mask given = LOAD(chances, 0) >= 0.0f;
+#if GLOSSY
     c.reflect = pick(given, LOAD(chances, 0), c.reflect);
+#endif
 #if TRANSMISSION
     c.refract = pick(given, LOAD(chances, 1), c.refract);
 #endif
@@ -36,13 +40,24 @@ static inline LobeChances load_chances(global const float *chances, Bsdf b, Floa
 kernel void list_chances(global const float *materials, global const float *wo, global float *chances)
 {
     const LobeChances c = lobe_chances(load_bsdf(materials), LOAD(wo, 2));
+#if GLOSSY
     STORE(chances, 0, c.reflect);
+#else
+    STORE(chances, 0, (Float)(0.0f));
+#endif
 #if TRANSMISSION
     STORE(chances, 1, c.refract);
 #else
     STORE(chances, 1, (Float)(0.0f));
 #endif
     STORE(chances, 2, c.diffuse);
+}
+
+/// left: what left_of_choice makes of the first of `numbers`.
+kernel void list_left_of_choice(
+    global const float *materials, global const float *wo, global const float *numbers, global float *left)
+{
+    STORE(left, 0, left_of_choice(lobe_chances(load_bsdf(materials), LOAD(wo, 2)), LOAD(numbers, 0)));
 }
 
 kernel void eval_pairs(

@@ -21,6 +21,11 @@ kernel void normalize_vectors(global const float *v, global float *units)
     store_vec3(units, 0, normalize3(LOAD_V(v, 0)));
 }
 
+kernel void renormalize_vectors(global const float *v, global float *units)
+{
+    store_vec3(units, 0, renormalize3(LOAD_V(v, 0)));
+}
+
 kernel void frame_of(global const float *n, global float *s, global float *t)
 {
     Vec3 a;
@@ -55,15 +60,33 @@ kernel void mask_lanes(
     store_vec3(picked_vectors, 0, pick_v(mask, vec3(a, b, a), vec3(b, a, b)));
 }
 
+/// Masks as bits, and back.
+kernel void mask_bits(global const uint *flags, global uint *bits, global uint *back)
+{
+    const uint lanes = lane_bits(LOAD_U(flags, 0) != 0u);
+    STORE_U(bits, 0, (UInt)(lanes));
+    STORE_U(back, 0, pick_u(lanes_of(lanes), (UInt)(1u), (UInt)(0u)));
+}
+
+kernel void least_of(global const float *x, global float *least)
+{
+    STORE(least, 0, (Float)(least_lane(LOAD(x, 0))));
+}
+
 typedef struct {
     float value;
     uint number;
 } Entry;
 
 kernel void gather_entries(
-    global const uint *indices, global const float *entries, global float *values, global uint *numbers)
+    global const uint *indices,
+    global const float *entries,
+    global float *values,
+    global uint *numbers,
+    global uint *words)
 {
     global const Entry *table = (global const Entry *)entries;
     STORE(values, 0, GATHER(table, LOAD_U(indices, 0), value));
     STORE_U(numbers, 0, GATHER_U(table, LOAD_U(indices, 0), number));
+    STORE_U(words, 0, GATHER_WORD((global const uint *)entries, LOAD_U(indices, 0)));
 }

@@ -58,6 +58,14 @@ kernel void list_densities(
 #endif
 }
 
+/// What alias_slot makes of bits.
+kernel void list_slots(global const uint *bits, global uint *slots, global float *left, const uint count)
+{
+    Float rest;
+    STORE_U(slots, 0, alias_slot(LOAD_U(bits, 0), count, &rest));
+    STORE(left, 0, rest);
+}
+
 kernel void look_up_sky(
     global const Params *params,
 #if ENVIRONMENT == 2
