@@ -269,8 +269,9 @@ def alias_table(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     scaled = weights * (len(weights) / weights.sum())
     keep = np.ones(len(weights))
     other = np.arange(len(weights), dtype=np.uint32)
-    light = np.flatnonzero(scaled < 1.0)
-    heavy = np.flatnonzero(scaled >= 1.0)
+    is_heavy = scaled >= 1.0
+    is_heavy[np.argmax(scaled)] = True  # Equal weights may all round to less than 1.
+    light, heavy = np.flatnonzero(~is_heavy), np.flatnonzero(is_heavy)
     lack = np.cumsum(1.0 - scaled[light])
     excess = np.cumsum(scaled[heavy] - 1.0)
     # A light slot is filled up by the heavy one that still has something left when its turn comes.

@@ -556,6 +556,7 @@ WEIGHTS = {
     "two": [1.0, 3.0],
     "three": [0.2, 5.0, 0.0],
     "equal": [2.0] * 7,
+    "equal, each below the mean by rounding": [0.1] * 13,
     "zeros but one": [0.0, 0.0, 1e-30, 0.0],
     "thousand": np.random.default_rng(0).random(1000) ** 8,
     "thousand with zeros": np.where(np.arange(1000) % 3, 0.0, np.arange(1000.0)),

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from psf_cl.scene.digest import scene_digest
+from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import (
     MAX_RADIANCE,
     Environment,
@@ -49,3 +54,28 @@ def test_a_sky_needs_a_factor_and_a_texel_that_are_not_black():
 
 def test_limited_radiance_fits_float32():
     assert limited((1e308, 2.0, 0.0)) == (MAX_RADIANCE, 2.0, 0.0)
+
+
+def test_a_digest_sees_what_the_picture_is_of_and_nothing_else():
+    path = Path(__file__).resolve().parents[1] / "scenes" / "ajar_door.toml"
+    scene = load_scene(path)
+    digest = scene_digest(scene)
+    assert digest == scene_digest(replace(load_scene(path), path="elsewhere", render={}, notes=()))
+
+    def changed(shape):
+        return replace(scene, shapes=(shape, *scene.shapes[1:]))
+
+    first = scene.shapes[0]
+    moved = first.transform.copy()
+    moved[0, 3] += 1e-6
+    positions = first.mesh.positions.copy()
+    positions[0, 0] += 1e-3
+    others = [
+        replace(scene, width=scene.width + 1),
+        changed(replace(first, transform=moved)),
+        changed(replace(first, mesh=replace(first.mesh, positions=positions))),
+        replace(scene, materials=scene.materials[:-1]),
+        replace(scene, environment=Environment(radiance=(0.0, 0.0, 1e-9))),
+        replace(scene, lights=(Light("point", (1.0, 1.0, 1.0)),)),
+    ]
+    assert len({digest, *map(scene_digest, others)}) == 1 + len(others)
