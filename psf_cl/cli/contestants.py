@@ -200,6 +200,9 @@ def _render(
             {"mark": mark, "seconds": seconds, "process_seconds": set_up + seconds, "spp": spp}
         )
 
+    def later(mark: int, seconds: float) -> bool:
+        return arena.marks[mark].seconds > seconds
+
     try:
         clock, last = renderer.scheduler.clock, len(arena.marks) - 1
         if not arena.marks[last].seconds:
@@ -208,22 +211,25 @@ def _render(
                 take(index, clock.now(), mark.spp)
             return rows
 
-        due = 0
+        # The first pass apart: a batch may complete several.
+        renderer.render(spp=1)
+        take(0, clock.now(), 1)
+        due = next(k for k in range(1, last + 1) if k == last or later(k, clock.now()))
 
         def follow(progress: Progress) -> None:
             nonlocal due
-            reached = progress.passes >= 1 and progress.seconds >= arena.marks[due].seconds
             # The last mark waits for the end: the pass in which the budget ends counts.
-            if reached and due < last:
+            if due < last and not later(due, progress.seconds):
                 with renderer.outside_time():
                     take(due, progress.seconds, progress.passes)
-                while due < last and arena.marks[due].seconds <= progress.seconds:
+                while due < last and not later(due, progress.seconds):
                     due += 1
 
-        renderer.render(seconds=arena.marks[last].seconds, progress=follow)
+        if later(last, clock.now()):
+            renderer.render(seconds=arena.marks[last].seconds, progress=follow)
         passes = renderer.scheduler.passes
-        if not rows or passes > rows[-1]["spp"]:
-            take(last if rows else 0, clock.now(), passes)
+        if passes > rows[-1]["spp"]:
+            take(last, clock.now(), passes)
     finally:
         renderer.close()
     return rows

@@ -120,7 +120,7 @@ def error_figure(study: Study) -> plot.Drawing:
         grey = [point.below_noise for point in points]
         for bias in (True, False):
             values = [
-                (point.seconds, *_bounds(point.split.bias2 if bias else point.split.variance))
+                (point.seconds, *_shown_bounds(point.split.bias2 if bias else point.split.variance))
                 for point in points
                 if point.split is not None
             ]
@@ -152,6 +152,12 @@ def _valid(points: Iterable[Point]) -> list[Point]:
 
 def _bounds(interval: Interval) -> tuple[float, float, float]:
     return interval.value, interval.low, interval.high
+
+
+def _shown_bounds(interval: Interval) -> tuple[float, float, float]:
+    """Return bounds for a plot: where 0 is possible, only the bar shows."""
+    value = math.nan if interval.contains(0.0) else interval.value
+    return value, interval.low, interval.high
 
 
 def _point_title(study: Study, entry: Entry, point: Point) -> str:
