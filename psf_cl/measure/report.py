@@ -305,8 +305,8 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[str | _Cell]]) -> str:
 
 
 def _summary_table(study: Study) -> str:
-    header = ["", "point", "runs", "samples", "render", "process", "relMSE", "trimmed"]
-    header += ["in the worst 0.1&nbsp;%", "variance", "bias&sup2;", "bias", "slope"]
+    header = ["", "point", "runs", "render time", "relMSE", "trimmed", "in the worst 0.1&nbsp;%"]
+    header += ["variance", "bias&sup2;", "bias", "slope"]
     rows = []
     for index, entry in enumerate(study.entries):
         name = _name_cell(index, entry)
@@ -319,11 +319,10 @@ def _summary_table(study: Study) -> str:
         split = point.split
         failed = len(entry.failures)
         cells = [
-            escape(study.marks[point.mark]),
+            escape(study.marks[point.mark])
+            + (f"<small>{point.spp:.0f} spp</small>" if point.spp else ""),
             f"{len(point.errors)}" + (f"<small>{failed} failed</small>" if failed else ""),
-            f"{point.spp:.0f}" if point.spp else "",
-            f"{point.seconds:.3g}&nbsp;s",
-            f"{point.process_seconds:.3g}&nbsp;s",
+            f"{point.seconds:.3g}&nbsp;s<small>process {point.process_seconds:.3g}&nbsp;s</small>",
             _interval_html(point.metrics["relmse"]),
             _interval_html(point.metrics["relmse_trimmed"]),
             f"{100.0 * point.worst_share:.0f}&nbsp;%",
