@@ -51,6 +51,7 @@ def test_the_wheel_carries_every_kernel_source_and_module(wheel):
         *(f"psf_cl/{path.relative_to(ROOT)}" for path in (ROOT / "cl").rglob("*.cl")),
         *(f"psf_cl/{path.relative_to(ROOT)}" for path in (ROOT / "cl").rglob("*.h")),
         *(str(path.relative_to(ROOT)) for path in (ROOT / "psf_cl").rglob("*.py")),
+        *(f"psf_cl/measure/report.{kind}" for kind in ("html", "css", "js")),
         "psf_cl/cl/__init__.py",
     }
     names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
