@@ -175,6 +175,7 @@ def test_commands_need_a_budget_and_an_output(text, message):
     assert split_command("a 'b c' {out} {seconds}", "{seconds}")[1] == "b c"
 
 
+@pytest.mark.slow
 def test_the_report_shows_bias_failures_and_goes_on(reference, other, tmp_path, capsys):
     folder = tmp_path / "out"
     arguments = ["--presets", "pt", "--run", "shallow: max_depth=1 sampler=random"]
