@@ -31,6 +31,9 @@
 #define STATUS_DONE 0xC0000000u // the path ended, the film does not have it yet
 #define STATUS_MASK 0xC0000000u
 #define DEPTH_MASK 0x3FFFFFFFu // bounces so far
+#define CELL_JITTER 1u // points are moved before they are told apart by cells
+#define CELL_IDENTITY 2u // every sample has a cell of its own: nothing is shared (tests)
+#define BUCKET_SLOTS 64u // slots of a hash map that are probed for a key
 
 #define PATH_ORIGIN_X 0u // ray origin, world, m
 #define PATH_ORIGIN_Y 1u
@@ -65,7 +68,17 @@
 #define PATH_LIGHT_R 30u // radiance that arrives if nothing is in between, times beta; all 0: no ray
 #define PATH_LIGHT_G 31u
 #define PATH_LIGHT_B 32u
-#define PATH_FIELD_COUNT 33u
+#if CELLS >= 1
+#define PATH_VERTEX (33u + 0u) // uint; 1 + depth of the vertex behind which light is shared; 0: none yet
+#define PATH_LENGTH (33u + 1u) // m, from the camera on
+#define PATH_BEYOND_R (33u + 2u) // of what was gathered, what is shared: it came from beyond that vertex
+#define PATH_BEYOND_G (33u + 3u)
+#define PATH_BEYOND_B (33u + 4u)
+#define PATH_END_1 (33u + 5u)
+#else
+#define PATH_END_1 33u
+#endif
+#define PATH_FIELD_COUNT PATH_END_1
 
 #define COUNTER_NEXT_PIXEL 0u // next pixel to be started, counted from the first pixel of next_pass
 #define COUNTER_NEXT_PASS 1u // pass that next_pixel 0 belongs to
@@ -78,10 +91,17 @@
 #define COUNTER_SHADOW_RAYS 8u // low word
 #define COUNTER_SHADOW_RAYS_HIGH 9u // high word
 #define COUNTER_REJECTED_SAMPLES 10u // samples that were not finite, or too large to be summed
-#define COUNTER_PENDING_CAMERA 11u // rays since the last film launch
-#define COUNTER_PENDING_BOUNCE 12u
-#define COUNTER_PENDING_SHADOW 13u
-#define COUNTER_FINISHED 14u // first of the ring: samples done of each pass in flight
+#define COUNTER_FAILED_INSERTS 11u // samples that found their part of the table of cells full
+#define COUNTER_REJECTED_CELLS 12u // samples too large for the sums of a cell
+#define COUNTER_UNFILTERED_SAMPLES 13u // samples with a vertex that looked for a cell and found none
+#define COUNTER_CELLS_USED 14u // low word; cells with samples, summed over passes
+#define COUNTER_CELLS_USED_HIGH 15u // high word
+#define COUNTER_CELL_PROBES 16u // low word; slots looked at to find each of these once
+#define COUNTER_CELL_PROBES_HIGH 17u // high word
+#define COUNTER_PENDING_CAMERA 18u // rays since the last film launch
+#define COUNTER_PENDING_BOUNCE 19u
+#define COUNTER_PENDING_SHADOW 20u
+#define COUNTER_FINISHED 21u // first of the ring: samples done of each pass in flight
 
 /// Everything that is the same for all paths of a render.
 typedef struct {
@@ -116,6 +136,14 @@ typedef struct {
     uint sampler; // SAMPLER_SOBOL or SAMPLER_RANDOM
     uint corner_count; // of the list of corners, where all triangles are tested
     uint face_count; // triangles between those corners
+    uint cell_slots; // of the table of cells of one pass, a power of two
+    uint cell_flags; // CELL_JITTER, CELL_IDENTITY
+    float cell_width; // edge of a cell in the first pass, m per m of the path
+    float cell_shrink; // exponent of the number of the pass in the edge of a cell
+    float cell_steps; // fixed-point steps of a sum of radiance per unit, a power of two
+    float cell_limit; // radiance from which a sample is too large for the sums
+    uint filter_vertex; // number of the vertex whose light is shared, 0 to choose
+    uint filter_direct; // whether light that falls on it directly is shared too
     uint pad[3]; // fills the record
 } Params;
 
@@ -236,3 +264,19 @@ typedef struct {
     float squares; // sum of squared deviations from it
     float pad[3]; // fills the record
 } FilmSum;
+
+/// The vertex of a sample behind which light is shared.
+typedef struct {
+    float p[3]; // world, m
+    uint ng; // geometric normal, octahedral, 16 bits a coordinate
+    float gate[3]; // throughput from the camera, times the reflectance that was taken out
+    float length; // m, of the path up to here
+} CellVertex;
+
+/// What a cell gathers: 64-bit fixed-point sums.
+typedef struct {
+    uint low[3]; // of radiance
+    uint count; // samples
+    uint high[3]; // of radiance
+    uint pad; // fills the record
+} Cell;

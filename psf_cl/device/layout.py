@@ -6,6 +6,7 @@ multiple of 16 bytes.  ``tools/make_layout.py`` writes the header; a test asks t
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -89,6 +90,14 @@ PARAMS = Record(
     uint sampler - SAMPLER_SOBOL or SAMPLER_RANDOM
     uint corner_count - of the list of corners, where all triangles are tested
     uint face_count - triangles between those corners
+    uint cell_slots - of the table of cells of one pass, a power of two
+    uint cell_flags - CELL_JITTER, CELL_IDENTITY
+    float cell_width - edge of a cell in the first pass, m per m of the path
+    float cell_shrink - exponent of the number of the pass in the edge of a cell
+    float cell_steps - fixed-point steps of a sum of radiance per unit, a power of two
+    float cell_limit - radiance from which a sample is too large for the sums
+    uint filter_vertex - number of the vertex whose light is shared, 0 to choose
+    uint filter_direct - whether light that falls on it directly is shared too
     uint pad[3] - fills the record
     """),
 )
@@ -244,6 +253,28 @@ FILM_SUM = Record(
     """),
 )
 
+CELL_VERTEX = Record(
+    "CellVertex",
+    "The vertex of a sample behind which light is shared.",
+    _fields("""
+    float p[3] - world, m
+    uint ng - geometric normal, octahedral, 16 bits a coordinate
+    float gate[3] - throughput from the camera, times the reflectance that was taken out
+    float length - m, of the path up to here
+    """),
+)
+
+CELL = Record(
+    "Cell",
+    "What a cell gathers: 64-bit fixed-point sums.",
+    _fields("""
+    uint low[3] - of radiance
+    uint count - samples
+    uint high[3] - of radiance
+    uint pad - fills the record
+    """),
+)
+
 RECORDS = (
     PARAMS,
     BVH_NODE,
@@ -257,9 +288,11 @@ RECORDS = (
     LIGHT,
     ENVIRONMENT_CELL,
     FILM_SUM,
+    CELL_VERTEX,
+    CELL,
 )
 
-#: Words of a path's state, in the order in which they lie in a block of the pool.
+#: Words of every path's state, in the order in which they lie in a block of the pool.
 PATH_FIELDS = (
     ("origin_x", "ray origin, world, m"),
     ("origin_y", ""),
@@ -296,6 +329,21 @@ PATH_FIELDS = (
     ("light_b", ""),
 )
 
+#: Words that only paths of some features have: (feature, least value of it, words).
+OPTIONAL_PATH_FIELDS = (
+    (
+        "CELLS",
+        1,
+        (
+            ("vertex", "uint; 1 + depth of the vertex behind which light is shared; 0: none yet"),
+            ("length", "m, from the camera on"),
+            ("beyond_r", "of what was gathered, what is shared: it came from beyond that vertex"),
+            ("beyond_g", ""),
+            ("beyond_b", ""),
+        ),
+    ),
+)
+
 #: Words of the counters, all uint.
 COUNTERS = (
     ("next_pixel", "next pixel to be started, counted from the first pixel of next_pass"),
@@ -309,6 +357,13 @@ COUNTERS = (
     ("shadow_rays", "low word"),
     ("shadow_rays_high", "high word"),
     ("rejected_samples", "samples that were not finite, or too large to be summed"),
+    ("failed_inserts", "samples that found their part of the table of cells full"),
+    ("rejected_cells", "samples too large for the sums of a cell"),
+    ("unfiltered_samples", "samples with a vertex that looked for a cell and found none"),
+    ("cells_used", "low word; cells with samples, summed over passes"),
+    ("cells_used_high", "high word"),
+    ("cell_probes", "low word; slots looked at to find each of these once"),
+    ("cell_probes_high", "high word"),
     ("pending_camera", "rays since the last film launch"),
     ("pending_bounce", ""),
     ("pending_shadow", ""),
@@ -346,6 +401,9 @@ CONSTANTS = (
     ("STATUS_DONE", 0xC0000000, "the path ended, the film does not have it yet"),
     ("STATUS_MASK", 0xC0000000, ""),
     ("DEPTH_MASK", 0x3FFFFFFF, "bounces so far"),
+    ("CELL_JITTER", 1, "points are moved before they are told apart by cells"),
+    ("CELL_IDENTITY", 2, "every sample has a cell of its own: nothing is shared (tests)"),
+    ("BUCKET_SLOTS", 64, "slots of a hash map that are probed for a key"),
 )
 
 _FRAME = """\
@@ -355,7 +413,6 @@ _FRAME = """\
 {constants}
 
 {paths}
-#define PATH_FIELD_COUNT {path_count}u
 
 {counters}
 
@@ -363,20 +420,49 @@ _FRAME = """\
 """
 
 
+def _define(name: str, value: str, meaning: str = "") -> str:
+    return f"#define {name} {value}" + (f" // {meaning}" if meaning else "")
+
+
+def _path_lines() -> list[str]:
+    """Return the places of the fields of a path; those of features follow one another."""
+    lines = [
+        _define(f"PATH_{name.upper()}", f"{index}u", meaning)
+        for index, (name, meaning) in enumerate(PATH_FIELDS)
+    ]
+    end = f"{len(PATH_FIELDS)}u"
+    for number, (feature, least, fields) in enumerate(OPTIONAL_PATH_FIELDS, start=1):
+        lines.append(f"#if {feature} >= {least}")
+        lines += [
+            _define(f"PATH_{name.upper()}", f"({end} + {index}u)", meaning)
+            for index, (name, meaning) in enumerate(fields)
+        ]
+        lines.append(_define(f"PATH_END_{number}", f"({end} + {len(fields)}u)"))
+        lines.append("#else")
+        lines.append(_define(f"PATH_END_{number}", end))
+        lines.append("#endif")
+        end = f"PATH_END_{number}"
+    return [*lines, _define("PATH_FIELD_COUNT", end)]
+
+
+def path_field_count(values: Mapping[str, int]) -> int:
+    """Return the words of a path's state under the ``values`` of the features."""
+    return len(PATH_FIELDS) + sum(
+        len(fields)
+        for feature, least, fields in OPTIONAL_PATH_FIELDS
+        if values.get(feature, 0) >= least
+    )
+
+
 def header() -> str:
     """Return the text of ``cl/common/layout.h``."""
 
     def define(name: str, value: int, meaning: str) -> str:
-        shown = f"0x{value:08X}u" if value > 0xFFFF else f"{value}u"
-        return f"#define {name} {shown}" + (f" // {meaning}" if meaning else "")
+        return _define(name, f"0x{value:08X}u" if value > 0xFFFF else f"{value}u", meaning)
 
     return _FRAME.format(
         constants="\n".join(define(*constant) for constant in CONSTANTS),
-        paths="\n".join(
-            define(f"PATH_{name.upper()}", index, meaning)
-            for index, (name, meaning) in enumerate(PATH_FIELDS)
-        ),
-        path_count=len(PATH_FIELDS),
+        paths="\n".join(_path_lines()),
         counters="\n".join(
             define(f"COUNTER_{name.upper()}", index, meaning)
             for index, (name, meaning) in enumerate(COUNTERS)
@@ -398,9 +484,12 @@ def path_fields(*names: str) -> tuple[str, ...]:
     Raises:
         ValueError: there is no such field.
     """
+    all_known = [known for known, _ in PATH_FIELDS]
+    for _, _, fields in OPTIONAL_PATH_FIELDS:
+        all_known += [known for known, _ in fields]
     found = []
     for name in names:
-        matching = [known for known, _ in PATH_FIELDS if name in (known, known.rpartition("_")[0])]
+        matching = [known for known in all_known if name in (known, known.rpartition("_")[0])]
         if not matching:
             raise ValueError(f"{name}: no such field of a path")
         found += matching

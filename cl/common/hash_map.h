@@ -1,0 +1,99 @@
+// A hash map of cells: slots claimed by atomics, sums in fixed point, the same result in any order.
+//
+// A key is a bucket and a 32-bit fingerprint, 0 for an empty slot.  Probing is linear, starts at a slot
+// that the fingerprint names, and wraps inside the bucket of up to BUCKET_SLOTS: whether a bucket has
+// room for all its keys then does not depend on the order in which they come.  A bucket that overflowed
+// is given up as a whole, for which keys it holds does depend on it.
+//
+// Binder, Fricke, Keller: Massively Parallel Path Space Filtering, 2019 (second hash in place of keys).
+#pragma once
+
+#include "lanes.h"
+#include "layout.h"
+#include "rng.h"
+
+#define NO_SLOT 0xffffffffu
+
+/// Slots of a bucket in a table of `slots`, a power of two.
+inline uint bucket_size(uint slots) { return min(slots, BUCKET_SLOTS); }
+
+/// Mix all bits of `x` by another bijection than mix_bits.  Appleby: MurmurHash3, finalizer.
+inline UInt mix_bits_too(UInt x)
+{
+    x ^= x >> 16;
+    x *= 0x85ebca6bu;
+    x ^= x >> 13;
+    x *= 0xc2b2ae35u;
+    x ^= x >> 16;
+    return x;
+}
+
+/// Fingerprint of a hash: 0 means an empty slot.
+inline UInt fingerprint(UInt hash) { return max(hash, (UInt)(1u)); }
+
+/// First slot of the bucket that a hash names.
+inline UInt bucket_of(UInt hash, uint slots) { return hash & (slots - 1u) & ~(bucket_size(slots) - 1u); }
+
+/// Slot of the key in its bucket, claimed if it was not there; NO_SLOT if the bucket is full.
+inline uint find_or_insert(volatile __global uint *keys, uint bucket, uint size, uint key)
+{
+    for (uint i = 0; i < size; ++i) {
+        const uint slot = bucket + ((key + i) & (size - 1u));
+        uint found = keys[slot];
+        if (found == 0u)
+            found = atomic_cmpxchg(&keys[slot], 0u, key);
+        if (found == 0u || found == key)
+            return slot;
+    }
+    return NO_SLOT;
+}
+
+/// Slot of the key in its bucket, NO_SLOT if it is not there.
+inline uint find(const __global uint *keys, uint bucket, uint size, uint key)
+{
+    for (uint i = 0; i < size; ++i) {
+        const uint slot = bucket + ((key + i) & (size - 1u));
+        const uint found = keys[slot];
+        if (found == key)
+            return slot;
+        if (found == 0u)
+            break;
+    }
+    return NO_SLOT;
+}
+
+/// Slots that were looked at before the one that a key took.
+inline uint probes_before(uint slot, uint size, uint key) { return (slot - key) & (size - 1u); }
+
+/// Steps of `value` (from 0 on, finite, below 2^63 / steps), rounded up with the chance of the fraction.
+///
+/// `u` in [0, 1).  From 2^24 steps on a float is a whole number of them.
+inline void to_fixed(Float value, Float steps, Float u, UInt *low, UInt *high)
+{
+    const Float x = value * steps;
+    const Float rounded = pick(x < 0x1p23f, floor(x + u), x);
+    const Float upper = floor(rounded * 0x1p-32f);
+    *high = to_uint(upper);
+    *low = to_uint(rounded - upper * 0x1p32f);
+}
+
+/// Value of a sum, in steps.
+inline Float from_fixed(UInt low, UInt high) { return to_float(high) * 0x1p32f + to_float(low); }
+
+/// Add to a 64-bit sum: a carry out of the low word belongs to whoever caused it.
+inline void add_fixed(volatile __global uint *low, volatile __global uint *high, uint more_low, uint more_high)
+{
+    uint carry = more_high;
+    if (more_low != 0u)
+        carry += atomic_add(low, more_low) + more_low < more_low;
+    if (carry != 0u)
+        atomic_add(high, carry);
+}
+
+/// Add `count` samples, whose radiance sums up to the fixed-point numbers given, to a cell.
+inline void add_to_cell(volatile __global Cell *cell, const uint *low, const uint *high, uint count)
+{
+    for (uint c = 0; c < 3; ++c)
+        add_fixed(&cell->low[c], &cell->high[c], low[c], high[c]);
+    atomic_add(&cell->count, count);
+}
