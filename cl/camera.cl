@@ -3,6 +3,7 @@
 #include "common/features.h"
 #include "common/lanes.h"
 #include "common/layout.h"
+#include "common/pixels.h"
 #include "common/pool.h"
 #include "common/rng.h"
 
@@ -15,28 +16,6 @@ inline UInt exponent_bits(Vec3 v)
 
 // From 2^96 on, a film's sums could overflow.
 #define MAX_EXPONENT_BITS 0x6f800000u
-
-/// x / d for all lanes: the processor divides no vectors of integers.
-inline UInt divide(UInt x, uint d)
-{
-    // The reciprocal is at most 1 too small, so the quotient is.
-    const UInt q = mul_hi(x, (UInt)(0xffffffffu / d));
-    return q + pick_u(x - q * d >= d, (UInt)(1u), (UInt)(0u));
-}
-
-/// Column and row on the film of entry `i` of the queue's order (tables.pixel_order).
-inline void pixel_place(__global const Params *params, UInt i, UInt *x, UInt *y)
-{
-    const uint strip_pixels = STRIP_ROWS * params->crop_width;
-    const UInt strip = divide(i, strip_pixels);
-    const UInt inside = i - strip * strip_pixels;
-    const UInt top = strip * STRIP_ROWS;
-    const UInt rows = min((UInt)(STRIP_ROWS), params->crop_height - top);
-    // Exact: `inside` is below 2^18, and a quotient plus half a row is far from integers.
-    const UInt column = to_uint((to_float(inside) + 0.5f) / to_float(rows));
-    *x = params->crop_x + column;
-    *y = params->crop_y + top + inside - column * rows;
-}
 
 /// Slots that have nothing to do but take the next sample.
 inline Mask is_free(UInt status)
@@ -70,6 +49,9 @@ inline uint regenerate(
 #if AOV_DIRECT
     __global float *direct,
 #endif
+#if CELLS
+    __global Beyond *beyond,
+#endif
     __global float *samples)
 {
     UInt status = get_u(path, PATH_STATUS);
@@ -85,6 +67,10 @@ inline uint regenerate(
 #if AOV_DIRECT
         Vec3 direct_part = get_v(path, PATH_DIRECT_R);
         exponent = max(exponent, exponent_bits(direct_part));
+#endif
+#if CELLS
+        const Vec3 shared = get_v(path, PATH_BEYOND_R);
+        exponent = max(exponent, exponent_bits(shared));
 #endif
         const Mask bad = done & (exponent >= MAX_EXPONENT_BITS);
         const Vec3 black = vec3_all((Float)(0.0f));
@@ -108,12 +94,25 @@ inline uint regenerate(
         store_lanes(direct_part.y, lane_direct[1]);
         store_lanes(direct_part.z, lane_direct[2]);
 #endif
+#if CELLS
+        // What is rejected is not shared.
+        uint lane_vertex[W];
+        float lane_shared[3][W];
+        store_lanes_u(pick_u(bad, (UInt)(0u), get_u(path, PATH_VERTEX)), lane_vertex);
+        store_lanes(shared.x, lane_shared[0]);
+        store_lanes(shared.y, lane_shared[1]);
+        store_lanes(shared.z, lane_shared[2]);
+#endif
         for (uint left = lane_bits(done); left; left &= left - 1u) {
             const uint k = lowest_bit(left);
             const ulong at = (ulong)lane_pass[k] * pixel_count + lane_pixel[k];
             vstore4((float4)(lane_value[0][k], lane_value[1][k], lane_value[2][k], 1.0f), at, samples);
 #if AOV_DIRECT
             vstore4((float4)(lane_direct[0][k], lane_direct[1][k], lane_direct[2][k], 1.0f), at, direct);
+#endif
+#if CELLS
+            vstore4((float4)(lane_shared[0][k], lane_shared[1][k], lane_shared[2][k], as_float(lane_vertex[k])),
+                    at, (__global float *)beyond);
 #endif
         }
         Mask uncounted = done;

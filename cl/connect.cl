@@ -5,6 +5,7 @@
 #include "common/layout.h"
 #include "common/pool.h"
 #include "common/trace.h"
+#include "common/cells.h"
 
 /// Trace the shadow rays of the W paths of a work item; returns how many there were.
 inline uint connect_paths(__global const Params *params, __global Float *path, GEOMETRY_PARAMETERS)
@@ -18,12 +19,18 @@ inline uint connect_paths(__global const Params *params, __global Float *path, G
                                       GEOMETRY_ARGUMENTS);
     const Vec3 zero = vec3_all((Float)(0.0f));
     const Vec3 arrives = pick_v(wanted & !blocked, light, zero);
-    put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), arrives));
-#if AOV_DIRECT
+#if AOV_DIRECT || CELLS
     // The vertex that sent the ray: the path has moved on unless it ended.
     const UInt status = get_u(path, PATH_STATUS);
     const UInt depth = (status & DEPTH_MASK)
                        - pick_u((status & STATUS_MASK) == STATUS_ALIVE, (UInt)(1u), (UInt)(0u));
+#endif
+#if CELLS
+    gather_light(path, shares_connection(params, get_u(path, PATH_VERTEX), depth), arrives);
+#else
+    put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), arrives));
+#endif
+#if AOV_DIRECT
     put_v(path, PATH_DIRECT_R, add(get_v(path, PATH_DIRECT_R), pick_v(depth == 0u, arrives, zero)));
 #endif
     put_v(path, PATH_LIGHT_R, zero);

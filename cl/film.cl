@@ -1,14 +1,7 @@
 // The film: sums of whole passes, in the order of the passes.
 
 #include "common/layout.h"
-
-/// Whether the counters say that pass `film_pass + k` is complete and wanted.
-inline int pass_is_complete(__global const Params *params, const volatile __global uint *counters, uint k)
-{
-    const uint pass = counters[COUNTER_FILM_PASS] + k;
-    return k < params->ring && pass < counters[COUNTER_PASS_LIMIT]
-           && counters[COUNTER_FINISHED + (pass & (params->ring - 1u))] == params->pixel_count;
-}
+#include "common/passes.h"
 
 /// Add one value to a compensated sum, so that the millionth sample still counts (Kahan 1965).
 inline void add_compensated(FilmSum *sum, uint c, float value)
@@ -32,15 +25,6 @@ inline void add_sample(FilmSum *sum, float4 sample)
     const float delta = y - sum->mean;
     sum->mean += delta / (float)sum->count;
     sum->squares = min(sum->squares + delta * (y - sum->mean), FLT_MAX);
-}
-
-/// Passes that are complete and wanted, from film_pass on.
-inline uint complete_passes(__global const Params *params, const volatile __global uint *counters)
-{
-    uint done = 0;
-    while (pass_is_complete(params, counters, done)) // at most params->ring
-        ++done;
-    return done;
 }
 
 /// Add every complete pass to the film.  One work item W sums: mostly there is nothing to add.

@@ -9,6 +9,7 @@
 #include "common/surface.h"
 #include "common/bsdf.h"
 #include "common/light.h"
+#include "common/cells.h"
 
 #define MAX_SURVIVAL 0.95f
 
@@ -92,6 +93,9 @@ kernel void shade_paths(
 #if AOV_FEATURES
     __global float *features,
 #endif
+#if CELLS
+    __global CellVertex *vertices,
+#endif
     __global float *pool)
 {
     const uint item = get_global_id(0);
@@ -161,7 +165,16 @@ kernel void shade_paths(
 #endif
 
     const Vec3 brought = pick_v(alive, mul(beta, emitted), zero);
+#if CELLS
+    UInt vertex = pick_u(camera_ray, (UInt)(0u), get_u(path, PATH_VERTEX));
+    const Float length = pick(camera_ray, (Float)(0.0f), FIELD(path, PATH_LENGTH)) + FIELD(path, PATH_HIT_T);
+    FIELD(path, PATH_LENGTH) = length;
+    put_v(path, PATH_BEYOND_R, pick_v(camera_ray, zero, get_v(path, PATH_BEYOND_R)));
+    put_u(path, PATH_VERTEX, vertex);
+    gather_light(path, shares_emission(params, vertex, depth), brought);
+#else
     put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), brought));
+#endif
 #if AOV_DIRECT
     put_v(path, PATH_DIRECT_R, add(get_v(path, PATH_DIRECT_R), pick_v(depth <= 1u, brought, zero)));
 #endif
@@ -200,6 +213,16 @@ kernel void shade_paths(
         put_u(path, PATH_STATUS, pick_u(alive, STATUS_DONE | depth, status));
         return;
     }
+
+#if CELLS
+    const Mask chosen = goes_on & (vertex == 0u)
+                        & wants_cell(params, depth, length, FIELD(path, PATH_HIT_T), pdf_bsdf);
+    if (any_lane(chosen)) {
+        store_cell_vertices(params, vertices, chosen, sample, pixel, s.p, s.ng, mul(beta, b.base_color), length);
+        vertex = pick_u(chosen, depth + 1u, vertex);
+        put_u(path, PATH_VERTEX, vertex);
+    }
+#endif
 
     Vec3 tangent;
     Vec3 bitangent;

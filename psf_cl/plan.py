@@ -14,7 +14,7 @@ from psf_cl.image import AOVS
 from psf_cl.measure.timing import Declared
 from psf_cl.scene.model import Scene, emits, has_environment, is_cut_out, shines
 from psf_cl.settings import Settings
-from psf_cl.stages import camera, connect, film, intersect, shade
+from psf_cl.stages import camera, cells, connect, film, intersect, shade
 from psf_cl.stages.spec import BufferSpec, Context, Feature, StageSpec
 from psf_cl.tables import few_triangles, flatten, visible_shapes
 from psf_cl.traits import DeviceTraits
@@ -173,7 +173,7 @@ def make_plan(
         else 0,
     )
     stages = []
-    for module in (camera, intersect, shade, connect, film):
+    for module in (camera, intersect, shade, connect, cells, film):
         stage = module.plan(context)
         if stage is not None:
             stages.append(stage)
@@ -200,7 +200,10 @@ def _ring(pixel_count: int, traits: DeviceTraits, features: dict[str, Feature]) 
     Long paths of an early pass must not stop the slots: a few times the pool in samples goes on
     behind them, at least two passes, as far as memory goes.
     """
-    sample_bytes = 16 * (1 + features["AOV_DIRECT"].value + 3 * features["AOV_FEATURES"].value)
+    planes = 1 + features["AOV_DIRECT"].value + 3 * features["AOV_FEATURES"].value
+    # With a vertex, what lies behind it, and about one cell: its sums and its key.
+    cell_bytes = 16 + 32 + 36 if features["CELLS"].value else 0
+    sample_bytes = 16 * planes + cell_bytes
     wanted = max(8 * traits.slots / pixel_count, 2)
     affordable = max(RING_BYTES / (sample_bytes * pixel_count), 2)
     ring = 2
@@ -287,6 +290,9 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             bool(feature_aovs),
             f"{', '.join(sorted(feature_aovs))} asked for",
             "no albedo, normal or depth was asked for",
+        ),
+        "CELLS": switch(
+            settings.path_filter == "hash_grid", "path_filter is hash_grid", "path_filter is off"
         ),
     }
 

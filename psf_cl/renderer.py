@@ -26,7 +26,7 @@ from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Scene, is_cut_out
 from psf_cl.scheduler import Hooks, Progress, Scheduler
 from psf_cl.settings import Settings, resolve
-from psf_cl.stages import film
+from psf_cl.stages import cells, film
 
 #: Looks of the host at the counters for each count of the paths by depth, which takes 0.4 ms on two
 #: CPU cores; the first look, which is left out, is at a pool that is still empty.
@@ -120,10 +120,14 @@ class Renderer:
             launch(items)
 
     def _film(self) -> None:
+        for launch in self.cell_launches:
+            launch(self._film_items(1), film.GROUP)
         for launch, planes in self.film_launches:
             launch(self._film_items(planes), film.GROUP)
         if self.half is not None:
             self.half(self._film_items(1), film.GROUP)
+        if self.clear_cells is not None:
+            self.clear_cells(cells.buckets(self.plan.pixel_count))
         self.advance(1)
 
     def _film_items(self, planes: int) -> int:
@@ -249,6 +253,8 @@ class Renderer:
                 self._add_launch(ring, name, planes, partial=True)(
                     self._film_items(planes), film.GROUP
                 )
+                if name == "film" and self.add_unfiltered is not None:
+                    self.add_unfiltered(self.plan.pixel_count, film.GROUP)
             sums[name] = self.device.read(self.buffers[name]).reshape(planes, -1)
             if partial:
                 self.device.fill(self.buffers[name])
@@ -312,6 +318,7 @@ class Renderer:
                 "rejected_samples": int(counters[layout.COUNTER_INDEX["rejected_samples"]]),
                 "dropped_triangles": self.dropped_triangles,
             },
+            "cells": self._cell_statistics(counters),
             "bvh": None
             if self.bvh is None
             else {
@@ -323,6 +330,23 @@ class Renderer:
                 name: getattr(self.settings, name) for name in self.settings.__dataclass_fields__
             },
             "seed": self.settings.seed,
+        }
+
+    def _cell_statistics(self, counters: np.ndarray) -> dict[str, int | float] | None:
+        if self.clear_cells is None:
+            return None
+
+        def whole(name: str) -> int:
+            at = layout.COUNTER_INDEX[name]
+            return int(counters[at]) + (int(counters[at + 1]) << 32)
+
+        names = ("failed_inserts", "rejected_cells", "unfiltered_samples")
+        used, passes = whole("cells_used"), max(self.scheduler.passes, 1)
+        slots = cells.slots_of(self.plan.pixel_count)
+        return {name: int(counters[layout.COUNTER_INDEX[name]]) for name in names} | {
+            "cells_per_pass": used / passes,
+            "load": used / passes / slots,
+            "mean_probes": whole("cell_probes") / max(used, 1),
         }
 
     @property
@@ -427,6 +451,7 @@ class Renderer:
             "direct_sampling": layout.CONSTANT[f"DIRECT_{settings.direct_sampling.upper()}"],
             "sampler": layout.CONSTANT[f"SAMPLER_{settings.sampler.upper()}"],
         }
+        values |= cells.parameters(scene, settings, self.plan.pixel_count)
         for name, value in values.items():
             params[0][name] = value
         return params
@@ -470,9 +495,10 @@ class Renderer:
                 -(-traits.slots // kernel.paths_per_item(traits)),
             )
             for stage in self.plan.stages
-            if stage.name != "film"
+            if not stage.per_pass
             for kernel in stage.kernels
         ]
+        self._bind_cells(programs.get("cells"))
         self.film_program = programs["film"]
         self.film_launches = [
             (self._add_launch(ring, name, planes, partial=False), planes)
@@ -493,6 +519,17 @@ class Renderer:
                 census=self.buffers["census"],
                 bins=film.CENSUS_BINS,
             )
+
+    def _bind_cells(self, program: Program | None) -> None:
+        self.cell_launches: list[Launch] = []
+        self.add_unfiltered = self.clear_cells = None
+        if program is None:
+            return
+        self.cell_launches, self.clear_cells, self.add_unfiltered = (
+            [program.bind_planned(name, self.buffers) for name in ("store_cells", "look_up_cells")],
+            program.bind_planned("clear_cells", self.buffers),
+            program.bind_planned("add_unfiltered", self.buffers),
+        )
 
     def _add_launch(self, ring: str, name: str, planes: int, partial: bool) -> Launch:
         return self.film_program.bind(

@@ -33,6 +33,10 @@ def _choice(default: str, *others: str, doc: str) -> Any:
     return field(default=default, metadata={"choices": (default, *others), "doc": doc})
 
 
+def _switch(default: bool, *, doc: str) -> Any:
+    return field(default=default, metadata={"switch": True, "doc": doc})
+
+
 def _number(default: Any, low: Any, high: Any, *, doc: str) -> Any:
     return field(default=default, metadata={"range": (low, high), "doc": doc})
 
@@ -55,6 +59,26 @@ class Settings:
     max_depth: int = _number(16, 0, 1 << 20, doc="bounces; 0 is what the camera sees directly")
     sampler: str = _choice(
         "sobol", "random", doc="Owen-scrambled Sobol' points, or independent numbers"
+    )
+    path_filter: str = _choice(
+        "off",
+        "hash_grid",
+        doc="share what paths carry beyond a vertex: averages per cell of a hash grid",
+    )
+    filter_vertex: str = _choice(
+        "auto",
+        *(str(number) for number in range(1, 9)),
+        doc="that vertex, 1 for the first surface seen; auto for the first after a wide bounce",
+    )
+    filter_direct: bool = _switch(
+        True, doc="share the light too that falls on that vertex directly"
+    )
+    cell_size: float = _number(8.0, 1e-3, 1e6, doc="edge of a cell in the first pass, pixels")
+    cell_jitter: bool = _switch(
+        True, doc="move points at random before cells are told apart: no blocks show"
+    )
+    cell_shrink: bool = _switch(
+        True, doc="make cells smaller from pass to pass: consistent; else the image stays blurred"
     )
     seed: int = _number(0, 0, 0xFFFFFFFF, doc="start of every random sequence")
 
@@ -83,8 +107,17 @@ class Settings:
 
 
 def _checked(item: dataclasses.Field[Any], value: Any, prefix: str) -> Any:
+    if item.metadata.get("switch"):
+        known = {"true": True, "false": False}
+        value = known.get(value, value) if isinstance(value, str) else value
+        if not isinstance(value, bool):
+            raise InputError(f"{prefix}{item.name} must be true or false; got {shown(value)}")
+        return value
     choices = item.metadata.get("choices")
     if choices is not None:
+        if isinstance(value, int) and not isinstance(value, bool):
+            # Some choices are numbers, which files need not quote.
+            value = str(value)
         if value not in choices:
             raise InputError(
                 f"{prefix}{item.name} must be one of {', '.join(choices)}; got {shown(value)}"
@@ -109,6 +142,7 @@ def _checked(item: dataclasses.Field[Any], value: Any, prefix: str) -> Any:
 
 PRESETS: dict[str, dict[str, Any]] = {
     "pt": {},
+    "psf": {"path_filter": "hash_grid"},
 }
 
 

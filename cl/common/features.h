@@ -43,3 +43,6 @@
 #ifndef FEW
 #error "FEW must be 0 (a tree), or the most corners of the list of triangles"
 #endif
+#ifndef CELLS
+#error "CELLS must be 0 or 1"
+#endif

@@ -31,6 +31,8 @@
 #define STATUS_DONE 0xC0000000u // the path ended, the film does not have it yet
 #define STATUS_MASK 0xC0000000u
 #define DEPTH_MASK 0x3FFFFFFFu // bounces so far
+#define FILTER_AUTO 0u // the first vertex that a wide lobe reached, over more than a cell
+#define FILTER_NONE 0xFFFFFFFFu // no vertex
 #define CELL_JITTER 1u // points are moved before they are told apart by cells
 #define CELL_IDENTITY 2u // every sample has a cell of its own: nothing is shared (tests)
 #define BUCKET_SLOTS 64u // slots of a hash map that are probed for a key
@@ -142,7 +144,7 @@ typedef struct {
     float cell_shrink; // exponent of the number of the pass in the edge of a cell
     float cell_steps; // fixed-point steps of a sum of radiance per unit, a power of two
     float cell_limit; // radiance from which a sample is too large for the sums
-    uint filter_vertex; // number of the vertex whose light is shared, 0 to choose
+    uint filter_vertex; // first vertex whose light may be shared; FILTER_AUTO, FILTER_NONE
     uint filter_direct; // whether light that falls on it directly is shared too
     uint pad[3]; // fills the record
 } Params;
@@ -272,6 +274,12 @@ typedef struct {
     float gate[3]; // throughput from the camera, times the reflectance that was taken out
     float length; // m, of the path up to here
 } CellVertex;
+
+/// What a sample gathered behind its cell's vertex.
+typedef struct {
+    float radiance[3]; // at the camera
+    uint vertex; // 1 + its depth, 0 if there is none
+} Beyond;
 
 /// What a cell gathers: 64-bit fixed-point sums.
 typedef struct {

@@ -96,7 +96,7 @@ PARAMS = Record(
     float cell_shrink - exponent of the number of the pass in the edge of a cell
     float cell_steps - fixed-point steps of a sum of radiance per unit, a power of two
     float cell_limit - radiance from which a sample is too large for the sums
-    uint filter_vertex - number of the vertex whose light is shared, 0 to choose
+    uint filter_vertex - first vertex whose light may be shared; FILTER_AUTO, FILTER_NONE
     uint filter_direct - whether light that falls on it directly is shared too
     uint pad[3] - fills the record
     """),
@@ -264,6 +264,15 @@ CELL_VERTEX = Record(
     """),
 )
 
+BEYOND = Record(
+    "Beyond",
+    "What a sample gathered behind its cell's vertex.",
+    _fields("""
+    float radiance[3] - at the camera
+    uint vertex - 1 + its depth, 0 if there is none
+    """),
+)
+
 CELL = Record(
     "Cell",
     "What a cell gathers: 64-bit fixed-point sums.",
@@ -289,6 +298,7 @@ RECORDS = (
     ENVIRONMENT_CELL,
     FILM_SUM,
     CELL_VERTEX,
+    BEYOND,
     CELL,
 )
 
@@ -401,6 +411,8 @@ CONSTANTS = (
     ("STATUS_DONE", 0xC0000000, "the path ended, the film does not have it yet"),
     ("STATUS_MASK", 0xC0000000, ""),
     ("DEPTH_MASK", 0x3FFFFFFF, "bounces so far"),
+    ("FILTER_AUTO", 0, "the first vertex that a wide lobe reached, over more than a cell"),
+    ("FILTER_NONE", 0xFFFFFFFF, "no vertex"),
     ("CELL_JITTER", 1, "points are moved before they are told apart by cells"),
     ("CELL_IDENTITY", 2, "every sample has a cell of its own: nothing is shared (tests)"),
     ("BUCKET_SLOTS", 64, "slots of a hash map that are probed for a key"),

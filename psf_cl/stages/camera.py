@@ -14,7 +14,7 @@ def plan(context: Context) -> StageSpec:
     samples = context.ring * context.pixel_count * 4
     float32, uint32 = np.dtype(np.float32), np.dtype(np.uint32)
     buffers = [
-        BufferSpec("pool", float32, slots * len(layout.PATH_FIELDS), f"state of {slots} paths"),
+        BufferSpec("pool", float32, slots * context.path_field_count, f"state of {slots} paths"),
         BufferSpec(
             "counters", uint32, layout.COUNTER_INDEX["finished"] + context.ring, "queue and rays"
         ),
@@ -24,21 +24,22 @@ def plan(context: Context) -> StageSpec:
     if context.on("AOV_DIRECT"):
         direct = ("direct",)
         buffers.append(BufferSpec("direct", float32, samples, "direct light of the same"))
+    shared = ("beyond", "vertex") if context.on("CELLS") else ()
     started = ("origin", "direction", "beta", "radiance", *direct, "seed", "status")
     named = ("sample", "pixel")
     kernel = KernelSpec(
         "regenerate_paths",
-        reads=(*started, *named),
+        reads=(*started, *named, *shared),
         writes=(*started, *named),
         # An entry of the order of pixels, and a weighted sample a plane.
-        record_bytes=4 + 16 * (1 + len(direct)),
+        record_bytes=4 + 16 * (1 + len(direct) + context.on("CELLS")),
         runs=True,
     )
     return StageSpec(
         "camera",
         "paths start at the camera",
         "camera.cl",
-        flags=("LENS", "AOV_DIRECT"),
+        flags=("LENS", "AOV_DIRECT", "CELLS"),
         kernels=(kernel,),
         buffers=tuple(buffers),
     )

@@ -10,10 +10,12 @@ def plan(context: Context) -> StageSpec | None:
     if not context.on("CONNECT"):
         return None
     direct = ("direct", "status") if context.on("AOV_DIRECT") else ()
+    shared = ("beyond",) if context.on("CELLS") else ()
+    moved = ("vertex", "status") if context.on("CELLS") else ()
     kernel = KernelSpec(
         "connect_lights",
-        reads=("light", "shadow", "toward", "radiance", *direct),
-        writes=("light", "radiance", *direct[:1]),
+        reads=("light", "shadow", "toward", "radiance", *direct, *shared, *moved),
+        writes=("light", "radiance", *direct[:1], *shared),
         rays=("shadow",),
         runs=True,
     )
@@ -21,7 +23,7 @@ def plan(context: Context) -> StageSpec | None:
         "connect",
         "sampled lights need to be seen",
         "connect.cl",
-        flags=("FEW", "ALPHA", "AOV_DIRECT"),
+        flags=("FEW", "ALPHA", "AOV_DIRECT", "CELLS"),
         kernels=(kernel,),
         traces=True,
     )

@@ -49,6 +49,8 @@ def plan(context: Context) -> StageSpec:
         "film",
         "samples are summed pass by pass",
         "film.cl",
+        flags=("CELLS",),
         kernels=tuple(kernels),
         buffers=tuple(buffers),
+        per_pass=True,
     )

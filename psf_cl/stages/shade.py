@@ -37,6 +37,7 @@ def plan(context: Context) -> StageSpec:
             "CONNECT",
             "AOV_DIRECT",
             "AOV_FEATURES",
+            "CELLS",
         ),
         kernels=(_kernel(context),),
         buffers=tuple(buffers),
@@ -47,7 +48,8 @@ def _kernel(context: Context) -> KernelSpec:
     """Return the kernel with what it reads and writes under the features that are on."""
     direct = ("direct",) if context.on("AOV_DIRECT") else ()
     shadow = ("shadow", "toward", "light") if context.on("CONNECT") else ()
-    walk = ("status", "direction", "beta", "radiance", "pdf", *direct)
+    shared = ("vertex", "length", "beyond") if context.on("CELLS") else ()
+    walk = ("status", "direction", "beta", "radiance", "pdf", *direct, *shared)
     records = [layout.SURFACE, layout.MATERIAL]
     if context.on("SMOOTH"):
         records.append(layout.NORMALS)
@@ -59,6 +61,8 @@ def _kernel(context: Context) -> KernelSpec:
             records += [layout.SURFACE, layout.MATERIAL]
     if context.features["ENVIRONMENT"].value == 2:
         records.append(layout.ENVIRONMENT_CELL)
+    if context.on("CELLS"):
+        records.append(layout.CELL_VERTEX)
     feature_bytes = 3 * 16 if context.on("AOV_FEATURES") else 0
     return KernelSpec(
         "shade_paths",

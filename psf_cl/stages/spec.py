@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from psf_cl.device.layout import path_fields
+from psf_cl.device.layout import path_field_count, path_fields
 from psf_cl.measure.timing import Declared
 from psf_cl.traits import DeviceTraits
 
@@ -74,6 +74,7 @@ class StageSpec:
         flags: the features that its source depends on; it is built with the others at 0.
         kernels: those that are launched.
         traces: whether it traces rays, which takes a stack of the tree's depth.
+        per_pass: whether it works on complete passes, not on the pool.
     """
 
     name: str
@@ -83,6 +84,7 @@ class StageSpec:
     kernels: tuple[KernelSpec, ...] = ()
     buffers: tuple[BufferSpec, ...] = ()
     traces: bool = False
+    per_pass: bool = False
 
     @property
     def kernel_names(self) -> tuple[str, ...]:
@@ -122,6 +124,11 @@ class Context:
     texture_count: int = 0
     statistics: bool = False
     halves: bool = False
+
+    @property
+    def path_field_count(self) -> int:
+        """Return the words of a path's state."""
+        return path_field_count({name: item.value for name, item in self.features.items()})
 
     def on(self, name: str) -> bool:
         return bool(self.features[name].value)

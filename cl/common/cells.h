@@ -1,0 +1,202 @@
+// Cells of path space: which vertices share their light, what of a path is shared, which cell a vertex
+// is in.
+#pragma once
+
+#include "lanes.h"
+#include "layout.h"
+#include "pool.h"
+#include "hash_map.h"
+#include "rng.h"
+
+/// What a cell is asked for, per lane.
+typedef struct {
+    Vec3 p;
+    Vec3 ng;
+    Float width;      // wanted edge of the cell, m
+    Mask seen;        // the camera sees the point: the edge follows its distance
+    UInt extra;       // told apart in addition; 0 for nothing
+} CellQuery;
+
+/// Where to look in the table.
+typedef struct {
+    UInt bucket;
+    UInt key;
+} CellKey;
+
+/// Pack a unit vector: 16 bits for each coordinate of the octahedron unfolded to a square.
+///
+/// Cigolle et al.: A Survey of Efficient Representations for Independent Unit Vectors, JCGT 3 (2), 2014.
+inline UInt pack_unit(Vec3 n)
+{
+    const Float inverse = 1.0f / max(fabs(n.x) + fabs(n.y) + fabs(n.z), 1e-20f);
+    Float x = n.x * inverse;
+    Float y = n.y * inverse;
+    const Float fold_x = (1.0f - fabs(y)) * pick(x >= 0.0f, (Float)(1.0f), (Float)(-1.0f));
+    const Float fold_y = (1.0f - fabs(x)) * pick(y >= 0.0f, (Float)(1.0f), (Float)(-1.0f));
+    const Mask below = n.z < 0.0f;
+    x = pick(below, fold_x, x);
+    y = pick(below, fold_y, y);
+    const Float most = (Float)(65534.0f);
+    const UInt a = to_uint(clamp(x * 32767.0f + 32767.5f, (Float)(0.0f), most));
+    const UInt b = to_uint(clamp(y * 32767.0f + 32767.5f, (Float)(0.0f), most));
+    return a | (b << 16);
+}
+
+inline Vec3 unpack_unit(UInt packed)
+{
+    const Float x = to_float(packed & 0xffffu) * (1.0f / 32767.0f) - 1.0f;
+    const Float y = to_float(packed >> 16) * (1.0f / 32767.0f) - 1.0f;
+    const Float z = 1.0f - fabs(x) - fabs(y);
+    const Float fold = max(-z, 0.0f);
+    const Float nx = x + pick(x >= 0.0f, -fold, fold);
+    const Float ny = y + pick(y >= 0.0f, -fold, fold);
+    return normalize3(vec3(nx, ny, z));
+}
+
+/// Side of the cube that a unit vector points to: axis and sign, 0 to 5.
+inline UInt cube_face(Vec3 n)
+{
+    const Float ax = fabs(n.x);
+    const Float ay = fabs(n.y);
+    const Float az = fabs(n.z);
+    const Mask on_x = (ax >= ay) & (ax >= az);
+    const Mask on_y = ay >= az;
+    const UInt axis = pick_u(on_x, (UInt)(0u), pick_u(on_y, (UInt)(1u), (UInt)(2u)));
+    const Float along = pick(on_x, n.x, pick(on_y, n.y, n.z));
+    return axis * 2u + pick_u(along < 0.0f, (UInt)(1u), (UInt)(0u));
+}
+
+/// Level of a cell of about `width`: the power of two below, or with the chance of the rest the one
+/// above, so that no seam shows where levels change.
+inline UInt cell_level(Float width, Float dither)
+{
+    const UInt bits = as_bits(clamp(width, (Float)(0x1p-60f), (Float)(0x1p60f)));
+    const Float rest = from_bits((bits & 0x007fffffu) | 0x3f800000u) - 1.0f;
+    return (bits >> 23) + pick_u(dither < rest, (UInt)(1u), (UInt)(0u));
+}
+
+/// Edge of the cells of a level.
+inline Float cell_edge(UInt level) { return from_bits(level << 23); }
+
+/// Return the cell of a point that is moved in its tangent plane by up to half a cell.
+///
+/// The level is chosen again after the move, or there would be cells of levels that no point that
+/// stays has.  Walls lie on planes of round numbers: the grid is shifted off these.
+inline CellKey cell_of(__global const Params *params, CellQuery q, UInt random_x, UInt random_y)
+{
+    const Float dither = unit_float(mix_bits(random_x ^ rotate(random_y, (UInt)(16u))));
+    UInt level = cell_level(q.width, dither);
+    Vec3 p = q.p;
+    if (params->cell_flags & CELL_JITTER) {
+        const Float edge = cell_edge(level);
+        Vec3 s;
+        Vec3 t;
+        make_frame(q.ng, &s, &t);
+        p = add_scaled(p, s, (unit_float(random_x) - 0.5f) * edge);
+        p = add_scaled(p, t, (unit_float(random_y) - 0.5f) * edge);
+        const Vec3 eye = vec3_of(params->camera_origin);
+        const Vec3 before = sub(q.p, eye);
+        const Vec3 after = sub(p, eye);
+        const Float ratio = sqrt(dot3(after, after) / max(dot3(before, before), 1e-30f));
+        level = cell_level(pick(q.seen, q.width * ratio, q.width), dither);
+    }
+    const Float inverse = 1.0f / cell_edge(level);
+    // A zero of its own sign would be another number: 0 is added.
+    const UInt x = as_bits(floor(p.x * inverse + 0.37f) + 0.0f);
+    const UInt y = as_bits(floor(p.y * inverse + 0.61f) + 0.0f);
+    const UInt z = as_bits(floor(p.z * inverse + 0.83f) + 0.0f);
+
+    UInt index = mix_bits(level + q.extra * 0x9e3779b9u);
+    index = mix_bits(index + x);
+    index = mix_bits(index + y);
+    index = mix_bits(index + z);
+    UInt print = mix_bits_too(level + cube_face(q.ng) * 0x01000193u + q.extra * 0x85ebca6bu);
+    print = mix_bits_too(print ^ x);
+    print = mix_bits_too(print ^ y);
+    print = mix_bits_too(print ^ z);
+    CellKey key;
+    key.bucket = bucket_of(index, params->cell_slots);
+    key.key = fingerprint(print);
+    return key;
+}
+
+/// Radiance behind a gate that let `beyond` through; 0 where next to nothing gets through.
+inline Vec3 demodulated(Vec3 beyond, Vec3 gate)
+{
+    const Mask r = gate.x > 1e-30f;
+    const Mask g = gate.y > 1e-30f;
+    const Mask b = gate.z > 1e-30f;
+    const Float zero = (Float)(0.0f);
+    const Float one = (Float)(1.0f);
+    // A 0 may have a sign, which counts where bits are compared: 0 is added.
+    return vec3(pick(r, beyond.x / pick(r, gate.x, one), zero) + 0.0f,
+                pick(g, beyond.y / pick(g, gate.y, one), zero) + 0.0f,
+                pick(b, beyond.z / pick(b, gate.z, one), zero) + 0.0f);
+}
+
+#if CELLS
+// What stages of the pool have to do with cells.
+
+/// Whether light that arrives at the vertex of `depth`, which found it itself, is shared.
+inline Mask shares_emission(__global const Params *params, UInt vertex, UInt depth)
+{
+    return (vertex != 0u) & (depth + params->filter_direct > vertex);
+}
+
+/// Whether light of a shadow ray from the vertex of `depth` is shared.
+inline Mask shares_connection(__global const Params *params, UInt vertex, UInt depth)
+{
+    return (vertex != 0u) & (depth + params->filter_direct >= vertex);
+}
+
+/// Add radiance to what a path gathered: the lanes of `shared` to what came from beyond its vertex.
+inline void gather_light(__global Float *path, Mask shared, Vec3 radiance)
+{
+    const Vec3 zero = vec3_all((Float)(0.0f));
+    put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), pick_v(shared, zero, radiance)));
+    put_v(path, PATH_BEYOND_R, add(get_v(path, PATH_BEYOND_R), pick_v(shared, radiance, zero)));
+}
+
+/// Whether this vertex is the one whose light is shared.
+///
+/// `spread` is the density of the direction that led here: a wide lobe has a low one.  A lobe's share
+/// of the surface is about distance^2 / density.
+inline Mask wants_cell(__global const Params *params, UInt depth, Float length, Float distance, Float spread)
+{
+    if (params->filter_vertex != FILTER_AUTO)
+        return depth + 1u >= params->filter_vertex;
+    const Float width = params->cell_width * length;
+    return (depth > 0u) & (distance * distance > width * width * max(spread, 3.0f));
+}
+
+/// Hand in the vertices of the lanes in `chosen`.
+inline void store_cell_vertices(
+    __global const Params *params,
+    __global CellVertex *vertices,
+    Mask chosen,
+    UInt sample,
+    UInt pixel,
+    Vec3 p,
+    Vec3 ng,
+    Vec3 gate,
+    Float length)
+{
+    uint lane_sample[W];
+    uint lane_pixel[W];
+    uint lane_ng[W];
+    float lane_value[7][W];
+    store_lanes_u(sample & (params->ring - 1u), lane_sample);
+    store_lanes_u(pixel, lane_pixel);
+    store_lanes_u(pack_unit(ng), lane_ng);
+    const Float values[7] = {p.x, p.y, p.z, gate.x, gate.y, gate.z, length};
+    for (uint c = 0; c < 7; ++c)
+        store_lanes(values[c], lane_value[c]);
+    for (uint left = lane_bits(chosen); left; left &= left - 1u) {
+        const uint k = lowest_bit(left);
+        const ulong at = (ulong)lane_sample[k] * params->pixel_count + lane_pixel[k];
+        vstore8((float8)(lane_value[0][k], lane_value[1][k], lane_value[2][k], as_float(lane_ng[k]),
+                         lane_value[3][k], lane_value[4][k], lane_value[5][k], lane_value[6][k]),
+                at, (__global float *)vertices);
+    }
+}
+#endif

@@ -1,0 +1,120 @@
+"""Cells: path space filtering, the average per cell in place of what each path gathered there."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from psf_cl.device import layout
+from psf_cl.device.hash_map import SUM_BITS, buckets_of, fixed_point, slots_for
+from psf_cl.scene.model import Scene
+from psf_cl.settings import Settings
+from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
+
+
+#: A sample may be so many times as bright as the brightest light before it is not shared.
+HEADROOM = 1024.0
+
+#: Cells of pass n have the edge n^(-1/6) of those of pass 1: bias falls as n^(-1/3), variance as 1 / n.
+#: Knaus, Zwicker: Progressive Photon Mapping: A Probabilistic Approach, 2011 (alpha = 2/3).
+SHRINK_EXPONENT = -1.0 / 6.0
+
+
+def slots_of(pixel_count: int) -> int:
+    """Return the slots of the table of a pass.
+
+    As many as there are samples: only where nearly all of them are alone can it overflow, and there
+    is nothing to share.
+    """
+    return slots_for(pixel_count)
+
+
+def buckets(pixel_count: int) -> int:
+    """Return the buckets of the table of a pass."""
+    return buckets_of(slots_of(pixel_count))
+
+
+def parameters(scene: Scene, settings: Settings, pixel_count: int) -> dict[str, Any]:
+    """Return what the kernels need to know, by the names of ``layout.PARAMS``."""
+    camera = scene.cameras[scene.camera]
+    pixel = 2.0 * math.tan(camera.fov_y / 2.0) / scene.height
+    steps = fixed_point(HEADROOM * brightest(scene), pixel_count)
+    return {
+        "cell_slots": slots_of(pixel_count),
+        "cell_flags": layout.CONSTANT["CELL_JITTER"] * settings.cell_jitter,
+        "cell_width": settings.cell_size * pixel,
+        "cell_shrink": SHRINK_EXPONENT if settings.cell_shrink else 0.0,
+        "cell_steps": steps,
+        "cell_limit": 2.0**SUM_BITS / steps / slots_for(pixel_count),
+        "filter_vertex": _vertex(settings),
+        "filter_direct": int(settings.filter_direct),
+    }
+
+
+def _vertex(settings: Settings) -> int:
+    if settings.path_filter == "off":
+        return layout.CONSTANT["FILTER_NONE"]
+    if settings.filter_vertex == "auto":
+        return layout.CONSTANT["FILTER_AUTO"]
+    return int(settings.filter_vertex)
+
+
+def brightest(scene: Scene) -> float:
+    """Return the largest radiance that anything emits; of lights without extent at 1 m."""
+    emitted = [max(material.emission) for material in scene.materials]
+    emitted += [max(light.intensity) for light in scene.lights]
+    image = scene.environment.image
+    sky = np.max(scene.environment.radiance) * (1.0 if image is None else float(np.max(image)))
+    largest = max([*emitted, float(sky)])
+    return min(max(largest, 2.0**-40), 2.0**90) if math.isfinite(largest) else 2.0**90
+
+
+def plan(context: Context) -> StageSpec | None:
+    """Return the stage, or None if paths are not filtered."""
+    if not context.on("CELLS"):
+        return None
+    slots, samples = slots_of(context.pixel_count), context.ring * context.pixel_count
+    cell, uint32 = layout.CELL.dtype, np.dtype(np.uint32)
+    in_flight = f"of {context.ring} passes in flight"
+    buffers = (
+        BufferSpec(
+            "beyond", layout.BEYOND.dtype, samples, f"light behind the vertices {in_flight}"
+        ),
+        BufferSpec("vertices", layout.CELL_VERTEX.dtype, samples, f"vertices {in_flight}"),
+        BufferSpec("cell_keys", uint32, context.ring * slots, "fingerprints of cells"),
+        BufferSpec("cells", cell, context.ring * slots, "sums of cells"),
+        BufferSpec(
+            "full_buckets",
+            uint32,
+            context.ring * buckets_of(slots),
+            "parts of tables that are full",
+        ),
+    )
+    sample_bytes = layout.BEYOND.dtype.itemsize + layout.CELL_VERTEX.dtype.itemsize
+    kernels = (
+        KernelSpec(
+            "store_cells",
+            record_bytes=sample_bytes + 4 + 2 * cell.itemsize,
+            per_sample=True,
+            hash_accesses=1,
+        ),
+        KernelSpec(
+            "look_up_cells",
+            record_bytes=sample_bytes + 4 + cell.itemsize + 2 * 16,
+            per_sample=True,
+            hash_accesses=1,
+        ),
+        KernelSpec("clear_cells", record_bytes=4, per_sample=True, lanes=False),
+        KernelSpec("add_unfiltered", lanes=False),
+    )
+    return StageSpec(
+        "cells",
+        "light is shared by the paths that meet in a cell",
+        "cells.cl",
+        flags=("CELLS",),
+        kernels=kernels,
+        buffers=buffers,
+        per_pass=True,
+    )
