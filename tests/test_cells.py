@@ -1,0 +1,252 @@
+"""Path space filtering against closed forms, plain path tracing and a model in NumPy."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene_builder import build, camera, floor, glowing, lambertian, render, renderer
+
+from psf_cl.device import layout
+from psf_cl.device.device import open_device
+from psf_cl.plan import make_plan
+from psf_cl.scene import primitives, transform
+from psf_cl.settings import Settings
+
+FILTER = {"path_filter": "hash_grid"}
+
+
+def room(size=(24, 16), **values):
+    """Return a lamp over a floor with a box on it: shadows, and light between surfaces."""
+    over = transform.translation((0.5, 2.0, 0)) @ transform.rotation_xyz_degrees((180, 0, 0))
+    box = transform.translation((0, 0.4, 0)) @ transform.scaling(0.4)
+    return build(
+        [
+            floor(3.0, lambertian((0.7, 0.5, 0.3))),
+            (primitives.box(), box, lambertian((0.3, 0.6, 0.8))),
+            (primitives.quad(), over @ transform.scaling(0.3), glowing((8.0, 6.0, 4.0))),
+        ],
+        camera((0, 1.5, 3), (0, 0.5, 0), 45),
+        size,
+        environment=0.2,
+        **values,
+    )
+
+
+def patched(opened, **values):
+    """Change parameters that no setting has."""
+    params = opened.device.read(opened.buffers["params"])
+    for name, value in values.items():
+        params[name] = value
+    opened.device.write(opened.buffers["params"], params)
+    return opened
+
+
+def one_cell(opened):
+    """Make cells larger than any scene, without jitter."""
+    return patched(opened, cell_width=1e30, cell_flags=0)
+
+
+def image_of(opened, spp):
+    try:
+        opened.render(spp=spp)
+        return opened.image()
+    finally:
+        opened.close()
+
+
+def test_filter_that_is_off_leaves_nothing_behind():
+    plan = make_plan(room(), Settings())
+    assert plan.features["CELLS"].value == 0
+    assert "cells" not in [stage.name for stage in plan.stages]
+    assert dict(plan.left_out)["cells"] == "path_filter is off"
+    pool = next(buffer for buffer in plan.buffers if buffer.name == "pool")
+    assert pool.count == plan.traits.slots * len(layout.PATH_FIELDS)
+    on = make_plan(room(), Settings(**FILTER))
+    more = next(buffer for buffer in on.buffers if buffer.name == "pool")
+    assert more.count == on.traits.slots * layout.path_field_count({"CELLS": 1})
+    assert more.count > pool.count
+
+
+@pytest.mark.parametrize("vertex", ["1", "2", "auto"])
+@pytest.mark.parametrize("direct", [True, False])
+def test_samples_with_cells_of_their_own_give_the_image_of_plain_path_tracing(
+    device, vertex, direct
+):
+    expected = render(device, room((48, 32)), 8).rgb
+    opened = renderer(
+        device,
+        room((48, 32)),
+        **FILTER,
+        filter_vertex=vertex,
+        filter_direct=direct,
+        cell_size=1.0,
+        cell_jitter=False,
+        cell_shrink=False,
+    )
+    identity = layout.CONSTANT["CELL_IDENTITY"]
+    image = image_of(patched(opened, cell_flags=identity), 8)
+    # A step of the sums is 1e-9 of the lamp's radiance; the light is divided and multiplied once.
+    np.testing.assert_allclose(image.rgb, expected, rtol=1e-5, atol=1e-6)
+    assert image.stats["cells"]["failed_inserts"] == image.stats["cells"]["rejected_cells"] == 0
+    stored = image.stats["cells"]["cells_per_pass"]
+    assert stored > 50
+
+
+def test_one_cell_for_all_gives_the_mean_of_all_that_falls_on_a_plane(device):
+    """A square under a sky of 1: every pixel of it shows its mean radiance, here its albedo."""
+    scene = build(
+        [floor(50.0, lambertian((0.2, 0.5, 0.8)))],
+        camera((0, 2, 0.001), (0, 0, 0), 40),
+        (16, 16),
+        environment=1.0,
+    )
+    # Without shadow rays the sky is all that is found: each sample is the albedo.
+    settings = {"direct_sampling": "bsdf"}
+    opened = renderer(device, scene, **FILTER, **settings, filter_vertex="1")
+    image = image_of(one_cell(opened), 1)
+    mean = image.rgb.mean(axis=(0, 1))
+    # All pixels have the same value, and it is the mean of the unfiltered image.
+    np.testing.assert_allclose(image.rgb, np.broadcast_to(mean, image.rgb.shape), rtol=1e-5)
+    plain = render(device, scene, 1, **settings)
+    np.testing.assert_allclose(mean, plain.rgb.mean(axis=(0, 1)), rtol=1e-5)
+    np.testing.assert_allclose(mean, (0.2, 0.5, 0.8), rtol=1e-4)
+
+
+def test_one_cell_for_all_shows_the_mean_of_a_lit_plane_times_its_texture(device):
+    """Two squares of different albedo share the light that falls on them."""
+    right = transform.translation((1, 0, 0))
+    left = transform.translation((-1, 0, 0))
+    over = transform.translation((-1.5, 1.0, 0)) @ transform.rotation_xyz_degrees((180, 0, 0))
+    scene = build(
+        [
+            (primitives.quad(), right, lambertian((0.1, 0.2, 0.9))),
+            (primitives.quad(), left, lambertian((0.8, 0.4, 0.2))),
+            (primitives.quad(), over @ transform.scaling(0.2), glowing(10.0)),
+        ],
+        camera((0, 6, 0.001), (0, 0, 0), 12),
+        (32, 32),
+    )
+    opened = renderer(device, scene, ["albedo"], **FILTER, filter_vertex="1")
+    image = image_of(one_cell(opened), 4)
+    plain = render(device, scene, 4, ["albedo"])
+    seen = plain.aovs["albedo"].min(axis=-1) > 0.05
+    edge = (image.aovs["albedo"].max(axis=-1) > 0.85) & seen
+    light = plain.rgb[seen] / plain.aovs["albedo"][seen]
+    shared = image.rgb[seen] / image.aovs["albedo"][seen]
+    assert edge.any() and light.std() > 0.3 * light.mean()
+    # Within a pass all light is equal; the means of four passes are those of plain path tracing.
+    np.testing.assert_allclose(
+        shared, np.broadcast_to(shared.mean(axis=0), shared.shape), rtol=1e-4
+    )
+    np.testing.assert_allclose(shared.mean(axis=0), light.mean(axis=0), rtol=1e-4)
+
+
+def test_a_plane_equals_a_model_of_its_cells(device):
+    """No jitter, edges of one level: cells are squares that NumPy tells apart as well."""
+    lamp = transform.translation((0.3, 0.5, 0.2)) @ transform.rotation_xyz_degrees((180, 0, 0))
+    scene = build(
+        [
+            floor(1.0, lambertian((0.5, 0.6, 0.7))),
+            (primitives.quad(), lamp @ transform.scaling(0.1), glowing(10.0)),
+        ],
+        # So far away that all paths are of about the same length: 200 m.
+        camera((0, 200, 0.001), (0, 0, 0), 0.6),
+        (48, 48),
+    )
+    settings = {**FILTER, "filter_vertex": "1", "cell_jitter": False, "cell_shrink": False}
+    opened = patched(renderer(device, scene, **settings), cell_width=0.25 / 199.99)
+    opened.render(spp=1)
+    pixels = opened.image().rgb.reshape(-1, 3)[opened.order]
+    beyond, vertices = (
+        opened.device.read(opened.buffers[name])[: len(pixels)] for name in ("beyond", "vertices")
+    )
+    opened.close()
+    low = (beyond["vertex"] == 1) & (np.abs(vertices["p"][:, 1]) < 1e-3)
+    assert low.sum() > 1500
+    gate = vertices["gate"][low].astype(np.float64)
+    np.testing.assert_allclose(gate, np.broadcast_to((0.5, 0.6, 0.7), gate.shape), rtol=1e-6)
+    places = vertices["p"][low].astype(np.float64) / 0.25 + (0.37, 0.61, 0.83)
+    _, cell = np.unique(np.floor(places), axis=0, return_inverse=True)
+    cell = cell.ravel()
+    assert cell.max() > 40
+    sums = np.zeros((cell.max() + 1, 3))
+    np.add.at(sums, cell, beyond["radiance"][low] / gate)
+    expected = (sums / np.bincount(cell)[:, None])[cell] * gate
+    # Lengths differ by 1e-4: a few samples are in cells of the next level, or look there.
+    found = np.isclose(pixels[low], expected, rtol=1e-4, atol=1e-5).all(axis=1)
+    assert found.mean() > 0.97
+    assert expected.std() > 0.3 * expected.mean()
+
+
+@pytest.mark.parametrize("slots", [1, 64])
+def test_tables_that_are_too_small_fall_back_to_plain_path_tracing(device, slots):
+    expected = render(device, room(), 4).rgb
+    opened = renderer(device, room(), **FILTER, filter_vertex="1", cell_size=0.001)
+    image = image_of(patched(opened, cell_slots=slots), 4)
+    assert image.stats["cells"]["failed_inserts"] > 0
+    np.testing.assert_allclose(image.rgb, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_same_bits_for_any_pool_and_steps_with_the_filter(device):
+    settings = {**FILTER, "cell_size": 4.0}
+    truth = render(device, room(), 24, ["variance"], **settings)
+    for slots in (128, 1024):
+        small = open_device(traits=replace(device.traits, slots=slots))
+        image = render(small, room(), 24, ["variance"], **settings)
+        assert image.rgb.tobytes() == truth.rgb.tobytes()
+        assert image.aovs["variance"].tobytes() == truth.aovs["variance"].tobytes()
+    opened = renderer(device, room(), ["variance"], **settings)
+    for _ in range(24):
+        opened.step()
+        opened.snapshot()
+    image = image_of(opened, 24)
+    assert image.rgb.tobytes() == truth.rgb.tobytes()
+
+
+def test_same_bits_where_the_table_is_half_full_of_holes(device):
+    """Buckets overflow in some passes: what happens there must not depend on the order."""
+    images = []
+    for slots in (128, 1024, device.traits.slots):
+        pool = open_device(traits=replace(device.traits, slots=slots))
+        opened = renderer(pool, room((64, 64)), **FILTER, filter_vertex="1", cell_size=1.0)
+        image = image_of(patched(opened, cell_slots=256), 6)
+        assert 0 < image.stats["cells"]["failed_inserts"]
+        assert image.stats["cells"]["unfiltered_samples"] < 6 * 64 * 64
+        images.append(image.rgb.tobytes())
+    assert images[0] == images[1] == images[2]
+
+
+@pytest.mark.parametrize(("one", "other"), [(1, 8), (8, 16)])
+def test_lane_widths_agree_with_the_filter(device, one, other):
+    def image(lanes):
+        traits = replace(device.traits, lanes=lanes, block=max(lanes, 8), slots=512)
+        settings = {**FILTER, "cell_size": 4.0}
+        return render(open_device(traits=traits), room(), 16, (), **settings).rgb
+
+    narrow, wide = image(one), image(other)
+    # A point that rounding moves into the next cell has another average: a few pixels may differ.
+    close = np.isclose(wide, narrow, rtol=1e-4, atol=1e-6).all(axis=-1)
+    assert close.mean() > 0.97
+    np.testing.assert_allclose(wide.mean(axis=(0, 1)), narrow.mean(axis=(0, 1)), rtol=1e-3)
+
+
+def test_an_interrupted_first_pass_shows_what_it_has(device):
+    """Nothing is averaged yet: the image is that of plain path tracing, interrupted alike."""
+    small = open_device(traits=replace(device.traits, slots=128))
+    opened = renderer(small, room((64, 64)), ["samples"], **FILTER, filter_vertex="1")
+    done = np.zeros(1)
+    while not done.any():
+        opened.scheduler.bounces = 1
+        opened.render(spp=1, progress=lambda now: False)
+        image = opened.image()
+        done = image.aovs["samples"][..., 0] > 0
+    assert opened.scheduler.passes == 0 and 0.01 < done.mean() < 1
+    expected = render(device, room((64, 64)), 1).rgb
+    np.testing.assert_allclose(image.rgb[done], expected[done], rtol=1e-5, atol=1e-6)
+    opened.render(spp=1)
+    whole = opened.image().rgb
+    opened.close()
+    again = render(device, room((64, 64)), 1, **FILTER, filter_vertex="1").rgb
+    np.testing.assert_array_equal(whole, again)
