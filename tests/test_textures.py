@@ -96,7 +96,11 @@ def textured(lane_device):
     lane_device.release(*buffers.values())
 
 
-def test_look_ups_equal_numpy(textured):
+LOOK_UPS = pytest.mark.parametrize("kernel", ["look_up", "look_up_all"])
+
+
+@LOOK_UPS
+def test_look_ups_equal_numpy(textured, kernel):
     rng = np.random.default_rng(1)
     count = 12000
     # Lanes of one work item look into different textures.
@@ -105,7 +109,7 @@ def test_look_ups_equal_numpy(textured):
     uv[:, 8000:] *= 100
     # Eighths fall on edges and middles of texels, exactly.
     uv[:, :4000] = np.round(uv[:, :4000] * 8) / 8
-    found = textured("look_up", {"index": index, "uv": uv}, 4)
+    found = textured(kernel, {"index": index, "uv": uv}, 4)
     size = np.array([t.pixels.shape[1::-1] for t in TEXTURES])[index]
     place = uv.T.astype(np.float64) * size
     expected = np.array(
@@ -122,12 +126,13 @@ def test_look_ups_equal_numpy(textured):
     assert (error <= tolerance)[~edge].all(), error[~edge].max()
 
 
-def test_coordinates_without_meaning_read_a_texel_of_the_texture(textured):
+@LOOK_UPS
+def test_coordinates_without_meaning_read_a_texel_of_the_texture(textured, kernel):
     values = [np.nan, np.inf, -np.inf, 1e9, -1e9, 3e38, -3e38, 1e-40]
     pairs = np.array(list(itertools.product(values, values)), np.float32)
     index = np.arange(len(TEXTURES), dtype=np.uint32).repeat(len(pairs))
     uv = np.tile(pairs, (len(TEXTURES), 1)).T
-    found = textured("look_up", {"index": index, "uv": np.ascontiguousarray(uv)}, 4)
+    found = textured(kernel, {"index": index, "uv": np.ascontiguousarray(uv)}, 4)
     assert np.isfinite(found).all()
     low = np.array([colors_of(t).min(axis=0) for t in TEXTURES])[index]
     high = np.array([colors_of(t).max(axis=0) for t in TEXTURES])[index]

@@ -44,7 +44,7 @@ typedef JOIN(int, W) Mask;
 // count_lanes(mask): how many; any_lane(mask): whether one; lanes_before(mask): how many lower ones a lane has;
 // lane_bits(mask): bit k is set where lane k is; lanes_of(bits): back; least_lane(x): the least.
 // GATHER(array, index, member): array[index].member of every lane, GATHER_U the same for uint;
-// GATHER_WORD(array, index): array[index] of uints.
+// GATHER_WORD(array, index): array[index] of uints; gather_words(array, index): of floats.
 #if W == 1
 inline float pick(int mask, float then, float otherwise) { return mask ? then : otherwise; }
 inline uint pick_u(int mask, uint then, uint otherwise) { return mask ? then : otherwise; }
@@ -65,6 +65,7 @@ inline uint load_lanes_u(const uint *array) { return array[0]; }
 #define GATHER(array, index, member) ((array)[index].member)
 #define GATHER_U(array, index, member) ((array)[index].member)
 #define GATHER_WORD(array, index) ((array)[index])
+inline float gather_words(__global const float *words, uint at) { return words[at]; }
 #else
 inline Float pick(Mask mask, Float then, Float otherwise) { return select(otherwise, then, mask); }
 inline UInt pick_u(Mask mask, UInt then, UInt otherwise) { return select(otherwise, then, mask); }

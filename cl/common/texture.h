@@ -1,4 +1,4 @@
-// Texture look-ups: scalar, one lane after the other.
+// Texture look-ups: of all lanes for shading, of one where traversal meets a cut-out.
 #pragma once
 
 #include "lanes.h"
@@ -37,8 +37,9 @@ inline float4 look_up_texture(
 
     float x = u * (float)width - (nearest ? 0.0f : 0.5f);
     float y = v * (float)height - (nearest ? 0.0f : 0.5f);
-    x = fabs(x) < 1e9f ? x : 0.0f;
-    y = fabs(y) < 1e9f ? y : 0.0f;
+    // From here on a float does not tell texels apart; NaN fails as well.
+    x = fabs(x) < 0x1p23f ? x : 0.0f;
+    y = fabs(y) < 0x1p23f ? y : 0.0f;
     const float x0 = floor(x);
     const float y0 = floor(y);
     const float fx = nearest ? 0.0f : x - x0;
@@ -61,6 +62,86 @@ inline float4 look_up_texture(
         }
     }
     return sum;
+}
+
+/// The two texels beside coordinate `x` along one axis, and the second one's weight, for all lanes.
+inline Float wrap_texels(
+    Float x, Float size, Mask clamped, Mask mirrored, Mask nearest, UInt *first, UInt *second)
+{
+    x = x * size - pick(nearest, (Float)(0.0f), (Float)(0.5f));
+    // From here on a float does not tell texels apart; NaN fails as well.
+    x = pick(fabs(x) < 0x1p23f, x, (Float)(0.0f));
+    const Float low = floor(x);
+    const Float period = pick(mirrored, size + size, size);
+    // The quotient may be off by one where it is nearly an integer.
+    Float a = low - floor(low / period) * period;
+    a = pick(a < 0.0f, a + period, a);
+    a = pick(a >= period, a - period, a);
+    Float b = a + 1.0f;
+    b = pick(b >= period, (Float)(0.0f), b);
+    a = pick(a < size, a, period - 1.0f - a);
+    b = pick(b < size, b, period - 1.0f - b);
+    const Float last = size - 1.0f;
+    *first = to_uint(pick(clamped, clamp(low, (Float)(0.0f), last), a));
+    *second = to_uint(pick(clamped, clamp(low + 1.0f, (Float)(0.0f), last), b));
+    return pick(nearest, (Float)(0.0f), x - low);
+}
+
+/// Add a texel of all lanes to a colour and its alpha.
+inline void add_texel(
+    UInt at,
+    Float weight,
+    Mask srgb,
+    __global const uchar4 *texels,
+    __global const float *srgb_to_linear,
+    Vec3 *color,
+    Float *alpha)
+{
+    const UInt texel = GATHER_WORD((__global const uint *)texels, at);
+    const UInt r = texel & 255u;
+    const UInt g = texel >> 8 & 255u;
+    const UInt b = texel >> 16 & 255u;
+    Vec3 c = scale(vec3(to_float(r), to_float(g), to_float(b)), (Float)(1.0f / 255.0f));
+    if (any_lane(srgb))
+        c = pick_v(srgb, vec3(gather_words(srgb_to_linear, r), gather_words(srgb_to_linear, g),
+                              gather_words(srgb_to_linear, b)), c);
+    *color = add_scaled(*color, c, weight);
+    *alpha += weight * (1.0f / 255.0f) * to_float(texel >> 24);
+}
+
+/// As look_up_texture for all lanes; `index` is that of a texture in every lane.
+LARGE_FUNCTION Vec3 look_up_textures(
+    __global const TextureInfo *textures,
+    __global const uchar4 *texels,
+    __global const float *srgb_to_linear,
+    UInt index,
+    Float u,
+    Float v,
+    Float *alpha)
+{
+    const UInt offset = GATHER_U(textures, index, offset);
+    const UInt width = GATHER_U(textures, index, width);
+    const UInt height = GATHER_U(textures, index, height);
+    const UInt flags = GATHER_U(textures, index, flags);
+    const Mask nearest = (flags & TEXTURE_NEAREST) != 0u;
+    const Mask srgb = (flags & TEXTURE_SRGB) != 0u;
+    UInt i0;
+    UInt i1;
+    UInt j0;
+    UInt j1;
+    const Float fx = wrap_texels(u, to_float(width), (flags & TEXTURE_CLAMP_U) != 0u,
+                                 (flags & TEXTURE_MIRROR_U) != 0u, nearest, &i0, &i1);
+    const Float fy = wrap_texels(v, to_float(height), (flags & TEXTURE_CLAMP_V) != 0u,
+                                 (flags & TEXTURE_MIRROR_V) != 0u, nearest, &j0, &j1);
+    const UInt row0 = offset + j0 * width;
+    const UInt row1 = offset + j1 * width;
+    Vec3 color = vec3_all((Float)(0.0f));
+    *alpha = (Float)(0.0f);
+    add_texel(row0 + i0, (1.0f - fx) * (1.0f - fy), srgb, texels, srgb_to_linear, &color, alpha);
+    add_texel(row0 + i1, fx * (1.0f - fy), srgb, texels, srgb_to_linear, &color, alpha);
+    add_texel(row1 + i0, (1.0f - fx) * fy, srgb, texels, srgb_to_linear, &color, alpha);
+    add_texel(row1 + i1, fx * fy, srgb, texels, srgb_to_linear, &color, alpha);
+    return color;
 }
 
 /// Texture coordinates of a point of a triangle.
@@ -88,26 +169,12 @@ LARGE_FUNCTION Vec3 textured(
     mask &= texture != NO_TEXTURE;
     if (!any_lane(mask))
         return color;
-    uint index[W];
-    uint id[W];
-    float lane_u[W];
-    float lane_v[W];
-    float r[W];
-    float g[W];
-    float b[W];
-    store_lanes_u(pick_u(mask, texture, (UInt)(NO_TEXTURE)), index);
-    store_lanes_u(triangle, id);
-    store_lanes(u, lane_u);
-    store_lanes(v, lane_v);
-    for (uint k = 0; k < W; ++k) {
-        float4 c = (float4)(1.0f);
-        if (index[k] != NO_TEXTURE) {
-            const float2 uv = triangle_uv(uvs, id[k], lane_u[k], lane_v[k]);
-            c = look_up_texture(textures, texels, srgb_to_linear, index[k], uv.x, uv.y);
-        }
-        r[k] = c.x;
-        g[k] = c.y;
-        b[k] = c.z;
-    }
-    return mul(color, vec3(load_lanes(r), load_lanes(g), load_lanes(b)));
+    const UInt at = pick_u(mask, triangle, (UInt)(0u));
+    const Float w = 1.0f - u - v;
+    const Float x = w * GATHER(uvs, at, uv0[0]) + u * GATHER(uvs, at, uv1[0]) + v * GATHER(uvs, at, uv2[0]);
+    const Float y = w * GATHER(uvs, at, uv0[1]) + u * GATHER(uvs, at, uv1[1]) + v * GATHER(uvs, at, uv2[1]);
+    Float alpha;
+    const Vec3 c =
+        look_up_textures(textures, texels, srgb_to_linear, pick_u(mask, texture, (UInt)(0u)), x, y, &alpha);
+    return mul(color, pick_v(mask, c, vec3_all((Float)(1.0f))));
 }

@@ -29,6 +29,21 @@ kernel void look_up(
         STORE(colors, k, load_lanes(c[k]));
 }
 
+/// The same by the function that looks up all lanes at once.
+kernel void look_up_all(
+    global const TextureInfo *textures,
+    global const uchar4 *texels,
+    global const float *srgb_to_linear,
+    global const uint *index,
+    global const float *uv,
+    global float *colors)
+{
+    Float alpha;
+    store_vec3(colors, 0, look_up_textures(textures, texels, srgb_to_linear, LOAD_U(index, 0), LOAD(uv, 0),
+                                           LOAD(uv, 1), &alpha));
+    STORE(colors, 3, alpha);
+}
+
 /// barycentrics: of the second and third corner.
 kernel void color_points(
     global const TextureInfo *textures,
