@@ -41,8 +41,14 @@ class DeviceTraits:
         """Return the table's row for ``kind``.
 
         CPU: PoCL vectorises only what is written as vectors, 16 lanes shade a vertex in 6 ns where
-        scalar code takes 27 to 83, and 16k to 64k slots are equally fast.  GPU: not measured; a
-        path a work item, blocks of 32 so that neighbours read neighbouring words.
+        scalar code takes 27 to 83; 16k to 64k slots and groups of 1 to 16 are equally fast, runs of
+        1 cost intersect and connect a tenth (two cores meet at one counter).  All triangles in
+        lanes took 0.4 of the time of a tree for 36 triangles, and breaks even at about 200.  To
+        measure again: ``python tools/kernel_timing.py SCENE --save a.json``, change the row,
+        ``--baseline a.json``; for cornell_box, ajar_door, glossy and a large scene of one's own.
+
+        GPU: not measured; a path a work item, blocks of 32 so that neighbours read neighbouring
+        words.
         """
         if kind == "cpu":
             return cls(
