@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -550,14 +551,19 @@ class Renderer:
         return [float(share) for share in shares]
 
 
-def prepare_device(text: str | None = None, profiling: bool = False) -> Device:
+def prepare_device(
+    text: str | None = None, profiling: bool = False, read: threading.Event | None = None
+) -> Device:
     """Open a device and make its tree builder ready: what can be done while a scene is read.
 
     Args:
         text: as in ``open_device``.
+        read: set when the scene is read.  If it is when the device is open, the scene is likely a
+            small one that needs no tree, and the builder is left to the renderer.
     """
     device = open_device(text, profiling=profiling)
-    warm_up_builder(device)
+    if read is None or not read.is_set():
+        warm_up_builder(device)
     return device
 
 
@@ -596,8 +602,10 @@ def render(
     check_budget(spp, seconds)
     if not isinstance(scene, Scene):
         with ThreadPoolExecutor(1) as background:
-            preparing = background.submit(prepare_device) if device is None else None
+            read = threading.Event()
+            preparing = background.submit(prepare_device, read=read) if device is None else None
             scene = load_scene(Path(scene))
+            read.set()
             device = preparing.result() if preparing else device
     renderer = Renderer(scene, resolve(scene.render, scene.path, preset, settings), device, outputs)
     try:

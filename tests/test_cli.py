@@ -119,7 +119,7 @@ def fake(monkeypatch, tmp_path):
     module(
         "psf_cl.renderer",
         Renderer=Renderer,
-        prepare_device=lambda name, profiling: f"device {name}",
+        prepare_device=lambda name, profiling, read: f"device {name}",
     )
     module("psf_cl.scene.load", load_scene=load_scene)
     monkeypatch.chdir(tmp_path)

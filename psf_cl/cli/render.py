@@ -104,8 +104,10 @@ def run(args: argparse.Namespace) -> int:
     # The device gets ready while the scene is read; a mistake in the scene does not wait for it.
     background = ThreadPoolExecutor(1)
     try:
-        opening = background.submit(open_prepared_device, args.device, statistics)
+        read = threading.Event()
+        opening = background.submit(open_prepared_device, args.device, statistics, read)
         scene, settings = load_with_settings(args)
+        read.set()
         check_distinct(outputs, [*scene.files, args.reference])
         make_plan(scene, settings, args.aov, crop=args.crop)  # For its checks.
         reference = _reference(args, scene) if args.reference else None
@@ -168,13 +170,15 @@ def run(args: argparse.Namespace) -> int:
     return 130 if stopped else 0
 
 
-def open_prepared_device(text: str | None, profiling: bool) -> Device:
+def open_prepared_device(
+    text: str | None, profiling: bool, read: threading.Event | None = None
+) -> Device:
     """Open a device and make it ready, or say what a missing OpenCL needs."""
     try:
         from psf_cl.renderer import prepare_device
     except ImportError as error:
         raise DeviceError(f"no OpenCL ({error}); psf-cl doctor says what to do") from error
-    return prepare_device(text, profiling)
+    return prepare_device(text, profiling, read)
 
 
 class ErrorCurve:
