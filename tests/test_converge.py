@@ -297,8 +297,8 @@ def test_an_interrupted_study_keeps_its_finished_runs_and_goes_on(reference, tmp
 def test_independent_numbers_converge_with_slope_minus_one(device, tmp_path):
     # Counted in samples, so that it holds on a busy machine too.
     reference = tmp_path / "ref.exr"
-    scene = psf_cl.load_scene(BOX, size=(64, 64))
-    image = psf_cl.render(scene, spp=1 << 15, device=device, seed=77)
+    scene = psf_cl.load_scene(BOX, size=(32, 32))
+    image = psf_cl.render(scene, spp=1 << 13, device=device, seed=77)
     write_exr(reference, Image({"rgb": image.rgb}))
     arguments = ["--run", "random: sampler=random", "--spp", "4,16,64,256"]
     assert converge(reference, tmp_path / "out", *arguments) == 0
