@@ -14,22 +14,28 @@ from scene_builder import LUMINANCE, build, camera, floor, glowing, render, rend
 
 from psf_cl.device.device import open_device
 from psf_cl.errors import InputError
+from psf_cl.plan import make_plan
 from psf_cl.scene import primitives, transform
+from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Light, Material
+from psf_cl.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUTS = ("albedo", "normal", "depth", "direct", "indirect", "variance", "samples")
 
 
-def scene(size=(24, 16)):
-    """Return a scene with an area light, a point light, a sky, and glossy things; 200 triangles."""
+def scene(size=(24, 16), columns=12):
+    """Return a scene with an area light, a point light, a sky, and glossy things.
+
+    It has 172 triangles and so a tree; with 6 ``columns`` 40, and so a list of them.
+    """
     over = transform.translation((0, 2.5, 0)) @ transform.rotation_xyz_degrees((180, 0, 0))
     metal = Material(base_color=(0.9, 0.7, 0.4), metallic=1.0, roughness=0.3)
     ball = transform.translation((0, 0.6, 0)) @ transform.scaling(0.6)
     return build(
         [
             floor(3.0, Material(roughness=0.6)),
-            (primitives.sphere(12, 8), ball, metal),
+            (primitives.sphere(columns, 2 * columns // 3), ball, metal),
             (primitives.quad(), over @ transform.scaling(0.3), glowing((8.0, 6.0, 4.0))),
         ],
         camera((0, 1.5, 3), (0, 0.5, 0), 45),
@@ -105,10 +111,24 @@ def test_two_renderers_alive_at_once_give_the_bits_that_each_gives_alone(device,
     second.close()
 
 
+def test_the_scenes_are_one_with_a_tree_and_one_with_a_list():
+    tree, few = (make_plan(scene(columns=columns), Settings()) for columns in (12, 6))
+    assert not tree.features["FEW"].value and few.features["FEW"].value
+
+
 @pytest.mark.parametrize("slots", [128, 1024])
-def test_size_of_the_pool_does_not_show(device, truth, slots):
-    small = open_device(traits=replace(device.traits, slots=slots))
+@pytest.mark.parametrize("run", [1, 3])
+def test_size_of_the_pool_does_not_show(device, truth, slots, run):
+    small = open_device(traits=replace(device.traits, slots=slots, run=run))
     assert_same_bits(render(small, scene(), 40, OUTPUTS), truth)
+
+
+def test_size_of_the_pool_does_not_show_without_a_tree(device):
+    few = scene(columns=6)
+    whole = render(device, few, 40, OUTPUTS)
+    for slots in (128, 1024):
+        small = open_device(traits=replace(device.traits, slots=slots))
+        assert_same_bits(render(small, few, 40, OUTPUTS), whole)
 
 
 @pytest.mark.parametrize("crop", [(0, 0, 24, 16), (5, 3, 7, 9), (23, 15, 1, 1), (0, 8, 24, 1)])
@@ -121,15 +141,29 @@ def test_crop_has_the_bits_of_its_part_of_the_whole(device, truth, crop):
         np.testing.assert_array_equal(part.aovs[name], expected, err_msg=name)
 
 
-@pytest.mark.parametrize(("one", "other"), [(1, 8), (8, 16)])
-def test_lane_widths_agree(device, one, other):
+def assert_lane_widths_agree(device, some_scene, spp, outputs=(), **settings):
     def image(lanes):
-        traits = replace(device.traits, lanes=lanes, block=max(lanes, 8), slots=512)
-        return render(open_device(traits=traits), scene(), 40, OUTPUTS)
+        traits = replace(device.traits, lanes=lanes, block=16, slots=1024)
+        return render(open_device(traits=traits), some_scene, spp, outputs, **settings)
 
-    narrow, wide = image(one), image(other)
-    for name, pixels in narrow.aovs.items():
-        np.testing.assert_allclose(wide.aovs[name], pixels, rtol=1e-5, atol=1e-7, err_msg=name)
+    narrow = image(1)
+    assert narrow.rgb.any()
+    for wide in (image(8), image(16)):
+        for name, pixels in narrow.aovs.items():
+            np.testing.assert_allclose(wide.aovs[name], pixels, rtol=1e-5, atol=1e-7, err_msg=name)
+
+
+@pytest.mark.parametrize("columns", [12, 6], ids=["tree", "list"])
+def test_lane_widths_agree(device, columns):
+    assert_lane_widths_agree(device, scene(columns=columns), 40, OUTPUTS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cornell_box", "ajar_door", "glossy"])
+def test_lane_widths_agree_on_the_scenes(device, name):
+    loaded = load_scene(ROOT / "scenes" / f"{name}.toml")
+    small = replace(loaded, width=64, height=48)
+    assert_lane_widths_agree(device, small, 64, OUTPUTS, **loaded.render)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (7, 1), (1, 17)])
@@ -195,10 +229,11 @@ from test_determinism import OUTPUTS, scene
 from scene_builder import render
 from psf_cl.device.device import open_device
 device = open_device()
-image = render(device, scene(), 40, OUTPUTS)
 digest = hashlib.sha256()
-for name in sorted(image.aovs):
-    digest.update(image.aovs[name].tobytes())
+for columns in (12, 6):
+    image = render(device, scene(columns=columns), 40, OUTPUTS)
+    for name in sorted(image.aovs):
+        digest.update(image.aovs[name].tobytes())
 print(device.cl_device.max_compute_units, digest.hexdigest())
 """
 
