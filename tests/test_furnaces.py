@@ -20,8 +20,10 @@ from scene_builder import (
     render,
 )
 
+from psf_cl.plan import make_plan
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.model import Environment, Material
+from psf_cl.settings import Settings
 
 Z_LIMIT = 5.0
 MIRRORED = transform.scaling((-1, 1, 1))
@@ -38,6 +40,19 @@ def test_closed_lambertian_box_has_radiance_one_everywhere(device, matrix, direc
         device, scene, 256, direct_sampling=direct_sampling, max_depth=1000, roulette_depth=12
     )
     assert_blocks_equal(image, 1.0, 0.005)
+
+
+def test_a_matt_furnace_is_the_same_in_a_build_with_gloss(device):
+    # Nothing reaches the metal behind the walls, but for its sake all is built.
+    walls = (inside_out(primitives.box()), IDENTITY, glowing(0.5, 0.5))
+    metal = (primitives.quad(), transform.translation((0, 5, 0)), Material(metallic=1.0))
+    images = []
+    for parts, gloss in (([walls], 0), ([walls, metal], 1)):
+        scene = build(parts, camera((0.3, 0.2, 0.6), (-0.5, -0.7, -1), 80), (16, 16))
+        assert make_plan(scene, Settings()).features["GLOSSY"].value == gloss
+        images.append(render(device, scene, 64, max_depth=100, roulette_depth=2))
+    assert_blocks_equal(images[0], 1.0, 0.05)
+    np.testing.assert_allclose(images[0].rgb, images[1].rgb, rtol=1e-5)
 
 
 @pytest.mark.slow
