@@ -210,7 +210,7 @@ inline uint regenerate(
 /// A sample that is not finite, or too large to be summed, is handed in as black and counted.
 ///
 /// reads   pool, counters
-/// writes  pool; samples (and direct) of finished paths; counters.{next_pixel, finished[],
+/// writes  pool; samples (direct, beyond) of finished paths; counters.{next_pixel, finished[],
 ///         rejected_samples, pending_camera}
 kernel void regenerate_paths(
     __global const Params *params,
@@ -218,6 +218,9 @@ kernel void regenerate_paths(
     volatile __global uint *counters,
 #if AOV_DIRECT
     __global float *direct,
+#endif
+#if CELLS
+    __global Beyond *beyond,
 #endif
     __global float *samples)
 {
@@ -235,6 +238,9 @@ kernel void regenerate_paths(
         claimed = regenerate(params, pool_at(pool, item), claimed, &tally, counters,
 #if AOV_DIRECT
                              direct,
+#endif
+#if CELLS
+                             beyond,
 #endif
                              samples);
     hand_in(&tally, counters);

@@ -5,7 +5,7 @@
 #include "common/layout.h"
 #include "common/pool.h"
 #include "common/trace.h"
-#include "common/cells.h"
+#include "common/sharing.h"
 
 /// Trace the shadow rays of the W paths of a work item; returns how many there were.
 inline uint connect_paths(__global const Params *params, __global Float *path, GEOMETRY_PARAMETERS)

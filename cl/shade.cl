@@ -9,7 +9,7 @@
 #include "common/surface.h"
 #include "common/bsdf.h"
 #include "common/light.h"
-#include "common/cells.h"
+#include "common/sharing.h"
 
 #define MAX_SURVIVAL 0.95f
 

@@ -13,7 +13,7 @@ import pytest
 from scene_builder import build, camera, floor, glowing, inside_out, lambertian
 
 from psf_cl.device.device import Device, open_device
-from psf_cl.device.layout import PATH_FIELDS, path_fields
+from psf_cl.device.layout import all_path_fields, path_fields
 from psf_cl.device.program import assemble
 from psf_cl.errors import InputError
 from psf_cl.measure import timing
@@ -238,7 +238,7 @@ def accesses(stage):
     """Return the fields of a path that a stage's source reads, and those that it writes."""
     text = re.sub(r"//[^\n]*", "", assemble(stage.source))
     text = re.sub(r"^\s*#\s*define PATH_.*$", "", text, flags=re.MULTILINE)
-    stems = {name.upper(): name for name, _ in PATH_FIELDS}
+    stems = {name.upper(): name for name in all_path_fields()}
     reads, writes = set(), set()
     pattern = r"(\bget_[uv]|\bput_[uv]|\bFIELD)\(\s*path,\s*PATH_(\w+)( \+ c)?\s*([,)])(\s*=[^=])?"
     uses = list(re.finditer(pattern, text))

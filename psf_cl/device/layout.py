@@ -490,18 +490,23 @@ RAY_KINDS = ("camera", "bounce", "shadow")
 CONSTANT = {name: value for name, value, _ in CONSTANTS}
 
 
+def all_path_fields() -> tuple[str, ...]:
+    """Return the fields of the path's state, those of features too."""
+    optional = (name for _, _, fields in OPTIONAL_PATH_FIELDS for name, _ in fields)
+    return (*(name for name, _ in PATH_FIELDS), *optional)
+
+
 def path_fields(*names: str) -> tuple[str, ...]:
     """Return the fields of the path's state that ``names`` tell of: fields, or stems of vectors.
 
     Raises:
         ValueError: there is no such field.
     """
-    all_known = [known for known, _ in PATH_FIELDS]
-    for _, _, fields in OPTIONAL_PATH_FIELDS:
-        all_known += [known for known, _ in fields]
     found = []
     for name in names:
-        matching = [known for known in all_known if name in (known, known.rpartition("_")[0])]
+        matching = [
+            known for known in all_path_fields() if name in (known, known.rpartition("_")[0])
+        ]
         if not matching:
             raise ValueError(f"{name}: no such field of a path")
         found += matching

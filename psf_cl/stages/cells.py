@@ -13,11 +13,11 @@ from psf_cl.scene.model import Scene
 from psf_cl.settings import Settings
 from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
 
-
 #: A sample may be so many times as bright as the brightest light before it is not shared.
 HEADROOM = 1024.0
 
-#: Cells of pass n have the edge n^(-1/6) of those of pass 1: bias falls as n^(-1/3), variance as 1 / n.
+#: Cells of pass n have the edge n^(-1/6) of those of pass 1: bias falls as n^(-1/3), variance
+#: as 1 / n.
 #: Knaus, Zwicker: Progressive Photon Mapping: A Probabilistic Approach, 2011 (alpha = 2/3).
 SHRINK_EXPONENT = -1.0 / 6.0
 

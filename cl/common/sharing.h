@@ -1,0 +1,72 @@
+// What of a path is shared: the vertex behind which light goes to a cell, and that light.
+#pragma once
+
+#include "lanes.h"
+#include "layout.h"
+#include "pool.h"
+#include "unit_vector.h"
+
+#if CELLS
+/// Whether light that arrives at the vertex of `depth`, which found it itself, is shared.
+inline Mask shares_emission(__global const Params *params, UInt vertex, UInt depth)
+{
+    return (vertex != 0u) & (depth + params->filter_direct > vertex);
+}
+
+/// Whether light of a shadow ray from the vertex of `depth` is shared.
+inline Mask shares_connection(__global const Params *params, UInt vertex, UInt depth)
+{
+    return (vertex != 0u) & (depth + params->filter_direct >= vertex);
+}
+
+/// Add radiance to what a path gathered: the lanes of `shared` to what came from beyond its vertex.
+inline void gather_light(__global Float *path, Mask shared, Vec3 radiance)
+{
+    const Vec3 zero = vec3_all((Float)(0.0f));
+    put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), pick_v(shared, zero, radiance)));
+    put_v(path, PATH_BEYOND_R, add(get_v(path, PATH_BEYOND_R), pick_v(shared, radiance, zero)));
+}
+
+/// Whether this vertex is the one whose light is shared.
+///
+/// `spread` is the density of the direction that led here: a wide lobe has a low one.  A lobe's share
+/// of the surface is about distance^2 / density.
+inline Mask wants_cell(__global const Params *params, UInt depth, Float length, Float distance, Float spread)
+{
+    if (params->filter_vertex != FILTER_AUTO)
+        return depth + 1u >= params->filter_vertex;
+    const Float width = params->cell_width * length;
+    return (depth > 0u) & (distance * distance > width * width * max(spread, 3.0f));
+}
+
+/// Hand in the vertices of the lanes in `chosen`.
+inline void store_cell_vertices(
+    __global const Params *params,
+    __global CellVertex *vertices,
+    Mask chosen,
+    UInt sample,
+    UInt pixel,
+    Vec3 p,
+    Vec3 ng,
+    Vec3 gate,
+    Float length)
+{
+    uint lane_sample[W];
+    uint lane_pixel[W];
+    uint lane_ng[W];
+    float lane_value[7][W];
+    store_lanes_u(sample & (params->ring - 1u), lane_sample);
+    store_lanes_u(pixel, lane_pixel);
+    store_lanes_u(pack_unit(ng), lane_ng);
+    const Float values[7] = {p.x, p.y, p.z, gate.x, gate.y, gate.z, length};
+    for (uint c = 0; c < 7; ++c)
+        store_lanes(values[c], lane_value[c]);
+    for (uint left = lane_bits(chosen); left; left &= left - 1u) {
+        const uint k = lowest_bit(left);
+        const ulong at = (ulong)lane_sample[k] * params->pixel_count + lane_pixel[k];
+        vstore8((float8)(lane_value[0][k], lane_value[1][k], lane_value[2][k], as_float(lane_ng[k]),
+                         lane_value[3][k], lane_value[4][k], lane_value[5][k], lane_value[6][k]),
+                at, (__global float *)vertices);
+    }
+}
+#endif

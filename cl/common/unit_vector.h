@@ -1,0 +1,34 @@
+// Unit vectors in a word.
+#pragma once
+
+#include "lanes.h"
+
+/// Pack a unit vector: 16 bits for each coordinate of the octahedron unfolded to a square.
+///
+/// Cigolle et al.: A Survey of Efficient Representations for Independent Unit Vectors, JCGT 3 (2), 2014.
+inline UInt pack_unit(Vec3 n)
+{
+    const Float inverse = 1.0f / max(fabs(n.x) + fabs(n.y) + fabs(n.z), 1e-20f);
+    Float x = n.x * inverse;
+    Float y = n.y * inverse;
+    const Float fold_x = (1.0f - fabs(y)) * pick(x >= 0.0f, (Float)(1.0f), (Float)(-1.0f));
+    const Float fold_y = (1.0f - fabs(x)) * pick(y >= 0.0f, (Float)(1.0f), (Float)(-1.0f));
+    const Mask below = n.z < 0.0f;
+    x = pick(below, fold_x, x);
+    y = pick(below, fold_y, y);
+    const Float most = (Float)(65534.0f);
+    const UInt a = to_uint(clamp(x * 32767.0f + 32767.5f, (Float)(0.0f), most));
+    const UInt b = to_uint(clamp(y * 32767.0f + 32767.5f, (Float)(0.0f), most));
+    return a | (b << 16);
+}
+
+inline Vec3 unpack_unit(UInt packed)
+{
+    const Float x = to_float(packed & 0xffffu) * (1.0f / 32767.0f) - 1.0f;
+    const Float y = to_float(packed >> 16) * (1.0f / 32767.0f) - 1.0f;
+    const Float z = 1.0f - fabs(x) - fabs(y);
+    const Float fold = max(-z, 0.0f);
+    const Float nx = x + pick(x >= 0.0f, -fold, fold);
+    const Float ny = y + pick(y >= 0.0f, -fold, fold);
+    return normalize3(vec3(nx, ny, z));
+}
