@@ -171,7 +171,12 @@ kernel void shade_paths(
     FIELD(path, PATH_LENGTH) = length;
     put_v(path, PATH_BEYOND_R, pick_v(camera_ray, zero, get_v(path, PATH_BEYOND_R)));
     put_u(path, PATH_VERTEX, vertex);
-    gather_light(path, shares_emission(params, vertex, depth), brought);
+#if CELLS == 2
+    Vec3 share = get_v(path, PATH_SHARE_R);
+    gather_light(path, shares_emission(params, vertex, depth), share, brought);
+#else
+    gather_light(path, shares_emission(params, vertex, depth), vec3_all((Float)(1.0f)), brought);
+#endif
 #else
     put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), brought));
 #endif
@@ -214,21 +219,28 @@ kernel void shade_paths(
         return;
     }
 
-#if CELLS
-    const Mask chosen = goes_on & (vertex == 0u)
-                        & wants_cell(params, depth, length, FIELD(path, PATH_HIT_T), pdf_bsdf);
-    if (any_lane(chosen)) {
-        store_cell_vertices(params, vertices, chosen, sample, pixel, s.p, s.ng, mul(beta, b.base_color), length);
-        vertex = pick_u(chosen, depth + 1u, vertex);
-        put_u(path, PATH_VERTEX, vertex);
-    }
-#endif
-
     Vec3 tangent;
     Vec3 bitangent;
     make_frame(s.ns, &tangent, &bitangent);
     const Vec3 wo_local = vec3(dot3(tangent, wo), dot3(bitangent, wo), max(dot3(s.ns, wo), (Float)(1e-6f)));
     const LobeChances chances = lobe_chances(b, wo_local.z);
+
+#if CELLS
+    // Light is divided by the reflectance of the base before it is shared: textures stay sharp.
+#if CELLS == 2
+    const Float base = base_gate(b, wo_local.z);
+    const Vec3 gate = mul(beta, scale(b.base_color, base));
+#else
+    const Vec3 gate = mul(beta, b.base_color);
+#endif
+    const Mask chosen = goes_on & (vertex == 0u) & (max3(gate) > 0.0f)
+                        & wants_cell(params, depth, length, FIELD(path, PATH_HIT_T), pdf_bsdf);
+    if (any_lane(chosen)) {
+        store_cell_vertices(params, vertices, chosen, sample, pixel, s.p, s.ng, gate, length);
+        vertex = pick_u(chosen, depth + 1u, vertex);
+        put_u(path, PATH_VERTEX, vertex);
+    }
+#endif
 
     // The seed names the pixel by its place on the film; it travels with the path.
     const UInt seed = get_u(path, PATH_SEED);
@@ -263,6 +275,9 @@ kernel void shade_paths(
         const Vec3 arrives =
             mul(mul(beta, f), scale(light.radiance, weight / pick(lit, light.pdf, (Float)(1.0f))));
         put_v(path, PATH_LIGHT_R, pick_v(lit, arrives, zero));
+#if CELLS == 2
+        put_v(path, PATH_LIGHT_SHARE_R, pick_v(chosen, base_share(b, base, wi_local, f), share));
+#endif
         // On the far side (glass) the ray starts below; the light stays where it is.
         const Vec3 origin = ray_origin(s, light.wi);
         put_v(path, PATH_SHADOW_X, origin);
@@ -278,6 +293,10 @@ kernel void shade_paths(
         add_scaled(add_scaled(scale(tangent, drawn.x), bitangent, drawn.y), s.ns, drawn.z));
     Float pdf;
     const Vec3 f = eval_bsdf(b, chances, wo_local, drawn, dot3(s.ng, wi), &pdf);
+#if CELLS == 2
+    share = pick_v(chosen, base_share(b, base, drawn, f), share);
+    put_v(path, PATH_SHARE_R, share);
+#endif
     beta = mul(beta, scale(f, 1.0f / pick(pdf > 0.0f, pdf, (Float)(1.0f))));
     const Float carried = beta.x + beta.y + beta.z;
     const Mask broken = goes_on & !(carried < INFINITY);

@@ -244,6 +244,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
     textured = any(
         m.base_color_texture >= 0 or (emits(m) and m.emission_texture >= 0) for m in materials
     )
+    glossy = any(m.metallic > 0.0 or m.specular > 0.0 or m.transmission > 0.0 for m in materials)
     feature_aovs = outputs & {"albedo", "normal", "depth"}
     return {
         "TEXTURES": switch(textured, "a material has a texture", "no material has a texture"),
@@ -258,7 +259,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "no mesh has shading normals",
         ),
         "GLOSSY": switch(
-            any(m.metallic > 0.0 or m.specular > 0.0 or m.transmission > 0.0 for m in materials),
+            glossy,
             "a material has a coat or is a metal",
             "every material is matt",
         ),
@@ -291,10 +292,17 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             f"{', '.join(sorted(feature_aovs))} asked for",
             "no albedo, normal or depth was asked for",
         ),
-        "CELLS": switch(
-            settings.path_filter == "hash_grid", "path_filter is hash_grid", "path_filter is off"
-        ),
+        "CELLS": _cells(settings, glossy),
     }
+
+
+def _cells(settings: Settings, glossy: bool) -> Feature:
+    """Return whether light is shared per cell, and if so how much of it."""
+    if settings.path_filter == "off":
+        return Feature(0, "path_filter is off")
+    if glossy:
+        return Feature(2, "path_filter is hash_grid; the light of diffuse bases is shared")
+    return Feature(1, "path_filter is hash_grid; every material is matt")
 
 
 def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
@@ -302,7 +310,7 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
 
     What is on keeps its value: as an image of one texel a constant sky would be sampled otherwise.
     """
-    most = {"ENVIRONMENT": 2}
+    most = {"ENVIRONMENT": 2, "CELLS": 2}
     full = {
         name: feature
         if feature.value

@@ -12,6 +12,7 @@ from psf_cl.device import layout
 from psf_cl.device.device import open_device
 from psf_cl.plan import make_plan
 from psf_cl.scene import primitives, transform
+from psf_cl.scene.model import Environment, Material
 from psf_cl.settings import Settings
 
 FILTER = {"path_filter": "hash_grid"}
@@ -250,3 +251,51 @@ def test_an_interrupted_first_pass_shows_what_it_has(device):
     opened.close()
     again = render(device, room((64, 64)), 1, **FILTER, filter_vertex="1").rgb
     np.testing.assert_array_equal(whole, again)
+
+
+def shiny(size=(48, 32)):
+    """Return the room with coats, metal and glass in it."""
+    over = transform.translation((0.5, 2.0, 0)) @ transform.rotation_xyz_degrees((180, 0, 0))
+
+    def ball(x):
+        return transform.translation((x, 0.4, 0)) @ transform.scaling(0.4)
+
+    return build(
+        [
+            floor(3.0, Material(base_color=(0.7, 0.5, 0.3), roughness=0.3)),
+            (primitives.sphere(12, 8), ball(-0.9), Material(metallic=0.6, roughness=0.2)),
+            (primitives.sphere(12, 8), ball(0.0), Material(transmission=0.7, roughness=0.1)),
+            (primitives.sphere(12, 8), ball(0.9), lambertian((0.2, 0.3, 0.9))),
+            (primitives.quad(), over @ transform.scaling(0.3), glowing((8.0, 6.0, 4.0))),
+        ],
+        camera((0, 1.5, 3), (0, 0.5, 0), 45),
+        size,
+        environment=0.2,
+    )
+
+
+@pytest.mark.parametrize("vertex", ["1", "2", "auto"])
+@pytest.mark.parametrize("direct", [True, False])
+def test_only_what_the_base_reflects_is_shared_and_all_of_it_arrives(device, vertex, direct):
+    expected = render(device, shiny(), 8).rgb
+    settings = {"filter_vertex": vertex, "filter_direct": direct, "cell_size": 1.0}
+    opened = renderer(device, shiny(), **FILTER, **settings)
+    assert opened.plan.features["CELLS"].value == 2
+    identity = layout.CONSTANT["CELL_IDENTITY"]
+    image = image_of(patched(opened, cell_flags=identity), 8)
+    # Colours are divided and multiplied once more than where all light is shared.
+    np.testing.assert_allclose(image.rgb, expected, rtol=2e-5, atol=2e-6)
+    assert image.stats["cells"]["cells_per_pass"] > 50
+
+
+def test_a_mirror_image_stays_sharp_under_the_filter(device):
+    """A metal has no diffuse base: nothing of it is shared, whatever the size of cells."""
+    scene = build(
+        [floor(3.0, Material(base_color=(0.9, 0.8, 0.7), metallic=1.0, roughness=0.2))],
+        camera((0, 1.5, 3), (0, 0.5, 0), 45),
+        (24, 16),
+        environment=Environment((1, 1, 1), np.random.default_rng(1).random((8, 16, 3), np.float32)),
+    )
+    filtered = render(device, scene, 4, **FILTER, filter_vertex="1", cell_size=64.0)
+    assert filtered.stats["cells"]["cells_per_pass"] == 0
+    np.testing.assert_array_equal(filtered.rgb, render(device, scene, 4).rgb)

@@ -213,6 +213,31 @@ inline Float pdf_ggx_reflect(Vec3 wo, Vec3 h, Float alpha)
     return ggx_d(h, alpha) / (2.0f * (ggx_bound(wo, alpha) * wo.z + ggx_stretch(wo.z, alpha)));
 }
 
+/// Factors of f cos of the diffuse base beside its colour: that of wo, and that of the light.
+inline Float base_gate(Bsdf b, Float cos_o)
+{
+    const Float stays = 1.0f - average_coat_albedo(b);
+    Float gate = (1.0f - b.metallic) * (1.0f - coat_albedo(b, cos_o)) / max(stays, 1e-6f);
+#if TRANSMISSION
+    gate *= 1.0f - b.transmission;
+#endif
+    return gate;
+}
+
+inline Float base_light(Bsdf b, Float cos_i) { return (1.0f - coat_albedo(b, cos_i)) * cos_i * INV_PI; }
+
+/// Share of `f`, which eval_bsdf gave for wo and wi, that the diffuse base has.
+inline Vec3 base_share(Bsdf b, Float gate, Vec3 wi, Vec3 f)
+{
+    const Float under = pick(wi.z > 0.0f, gate * base_light(b, max(wi.z, 0.0f)), (Float)(0.0f));
+    const Vec3 base = scale(b.base_color, under);
+    const Float one = (Float)(1.0f);
+    const Float zero = (Float)(0.0f);
+    return vec3(pick(f.x > 0.0f, min(base.x / pick(f.x > 0.0f, f.x, one), one), zero),
+                pick(f.y > 0.0f, min(base.y / pick(f.y > 0.0f, f.y, one), one), zero),
+                pick(f.z > 0.0f, min(base.z / pick(f.z > 0.0f, f.z, one), one), zero));
+}
+
 /// f(wo, wi) |cos wi|, and the density with which sample_bsdf draws wi.
 ///
 /// `wi_side` > 0 where wi is on wo's side of the real surface: shading normals must not leak light.
@@ -229,14 +254,7 @@ LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Flo
     const Vec3 fresnel = lerp3(vec3_all(f), metal, b.metallic);
     const Float mirror = ggx_d(h, b.alpha) * ggx_visibility(wo.z, cos_i, b.alpha) * cos_i;
 
-    // Schlick's average over the hemisphere, weighted by the cosine, is f0 + (f90 - f0) / 21.
-    const Float enters = 1.0f - coat_albedo(b, wo.z);
-    const Float leaves = 1.0f - coat_albedo(b, cos_i);
-    const Float stays = 1.0f - average_coat_albedo(b);
-    Float under = (1.0f - b.metallic) * enters * leaves / max(stays, 1e-6f) * cos_i * INV_PI;
-#if TRANSMISSION
-    under *= 1.0f - b.transmission;
-#endif
+    const Float under = base_gate(b, wo.z) * base_light(b, cos_i);
     Vec3 value = add_scaled(scale(fresnel, mirror), b.base_color, under);
     Float density = chances.diffuse * cos_i * INV_PI;
     density += pick(chances.reflect > 0.0f, chances.reflect * pdf_ggx_reflect(wo, h, b.alpha), (Float)(0.0f));

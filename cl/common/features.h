@@ -44,5 +44,5 @@
 #error "FEW must be 0 (a tree), or the most corners of the list of triangles"
 #endif
 #ifndef CELLS
-#error "CELLS must be 0 or 1"
+#error "CELLS must be 0, 1 (all of a vertex's light is shared) or 2 (that of its diffuse base)"
 #endif

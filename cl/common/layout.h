@@ -80,7 +80,18 @@
 #else
 #define PATH_END_1 33u
 #endif
-#define PATH_FIELD_COUNT PATH_END_1
+#if CELLS >= 2
+#define PATH_SHARE_R (PATH_END_1 + 0u) // part of what comes from beyond the vertex that its diffuse base reflects
+#define PATH_SHARE_G (PATH_END_1 + 1u)
+#define PATH_SHARE_B (PATH_END_1 + 2u)
+#define PATH_LIGHT_SHARE_R (PATH_END_1 + 3u) // the same of the shadow ray
+#define PATH_LIGHT_SHARE_G (PATH_END_1 + 4u)
+#define PATH_LIGHT_SHARE_B (PATH_END_1 + 5u)
+#define PATH_END_2 (PATH_END_1 + 6u)
+#else
+#define PATH_END_2 PATH_END_1
+#endif
+#define PATH_FIELD_COUNT PATH_END_2
 
 #define COUNTER_NEXT_PIXEL 0u // next pixel to be started, counted from the first pixel of next_pass
 #define COUNTER_NEXT_PASS 1u // pass that next_pixel 0 belongs to

@@ -19,12 +19,13 @@ inline Mask shares_connection(__global const Params *params, UInt vertex, UInt d
     return (vertex != 0u) & (depth + params->filter_direct >= vertex);
 }
 
-/// Add radiance to what a path gathered: the lanes of `shared` to what came from beyond its vertex.
-inline void gather_light(__global Float *path, Mask shared, Vec3 radiance)
+/// Add radiance to what a path gathered: `share` of the lanes of `shared` to what came from beyond its
+/// vertex.
+inline void gather_light(__global Float *path, Mask shared, Vec3 share, Vec3 radiance)
 {
-    const Vec3 zero = vec3_all((Float)(0.0f));
-    put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), pick_v(shared, zero, radiance)));
-    put_v(path, PATH_BEYOND_R, add(get_v(path, PATH_BEYOND_R), pick_v(shared, radiance, zero)));
+    const Vec3 part = pick_v(shared, mul(share, radiance), vec3_all((Float)(0.0f)));
+    put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), sub(radiance, part)));
+    put_v(path, PATH_BEYOND_R, add(get_v(path, PATH_BEYOND_R), part));
 }
 
 /// Whether this vertex is the one whose light is shared.

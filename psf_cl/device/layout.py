@@ -352,6 +352,18 @@ OPTIONAL_PATH_FIELDS = (
             ("beyond_b", ""),
         ),
     ),
+    (
+        "CELLS",
+        2,
+        (
+            ("share_r", "part of what comes from beyond the vertex that its diffuse base reflects"),
+            ("share_g", ""),
+            ("share_b", ""),
+            ("light_share_r", "the same of the shadow ray"),
+            ("light_share_g", ""),
+            ("light_share_b", ""),
+        ),
+    ),
 )
 
 #: Words of the counters, all uint.

@@ -12,6 +12,8 @@ def plan(context: Context) -> StageSpec | None:
     direct = ("direct", "status") if context.on("AOV_DIRECT") else ()
     shared = ("beyond",) if context.on("CELLS") else ()
     moved = ("vertex", "status") if context.on("CELLS") else ()
+    if context.features["CELLS"].value == 2:
+        moved = (*moved, "light_share")
     kernel = KernelSpec(
         "connect_lights",
         reads=("light", "shadow", "toward", "radiance", *direct, *shared, *moved),

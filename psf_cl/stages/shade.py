@@ -47,8 +47,12 @@ def plan(context: Context) -> StageSpec:
 def _kernel(context: Context) -> KernelSpec:
     """Return the kernel with what it reads and writes under the features that are on."""
     direct = ("direct",) if context.on("AOV_DIRECT") else ()
+    cells = context.features["CELLS"].value
+    shared = ("vertex", "length", "beyond") if cells else ()
+    shared += ("share",) if cells == 2 else ()
     shadow = ("shadow", "toward", "light") if context.on("CONNECT") else ()
-    shared = ("vertex", "length", "beyond") if context.on("CELLS") else ()
+    if cells == 2 and shadow:
+        shadow += ("light_share",)
     walk = ("status", "direction", "beta", "radiance", "pdf", *direct, *shared)
     records = [layout.SURFACE, layout.MATERIAL]
     if context.on("SMOOTH"):
