@@ -8,13 +8,14 @@
 #include "common/sharing.h"
 
 /// Trace the shadow rays of the W paths of a work item; returns how many there were.
-inline uint connect_paths(__global const Params *params, __global Float *path, GEOMETRY_PARAMETERS)
+inline uint connect_paths(__global const Params *params, __global Float *path, GEOMETRY_BUFFERS)
 {
     const Vec3 light = get_v(path, PATH_LIGHT_R);
     // Not a number must not vanish here: it goes on into the sample, which is rejected and counted.
     const Mask wanted = !(light.x + light.y + light.z <= 0.0f);
     if (!any_lane(wanted))
         return 0;
+    DEFINE_RAY_SEEDS(path, (get_u(path, PATH_STATUS) & DEPTH_MASK) * 2u + 1u);
     const Mask blocked = blocked_rays(params, wanted, get_v(path, PATH_SHADOW_X), get_v(path, PATH_TOWARD_X),
                                       GEOMETRY_ARGUMENTS);
     const Vec3 zero = vec3_all((Float)(0.0f));
@@ -52,13 +53,13 @@ kernel void connect_lights(
     __global const Params *params,
     __global float *pool,
     volatile __global uint *counters,
-    GEOMETRY_PARAMETERS)
+    GEOMETRY_BUFFERS)
 {
     const uint first = get_global_id(0) * RUN;
     const uint end = min(first + RUN, params->slots / W);
     uint wanted = 0;
     for (uint item = first; item < end; ++item)
-        wanted += connect_paths(params, pool_at(pool, item), GEOMETRY_ARGUMENTS);
+        wanted += connect_paths(params, pool_at(pool, item), GEOMETRY_BUFFER_ARGUMENTS);
     if (wanted > 0)
         atomic_add(&counters[COUNTER_PENDING_SHADOW], wanted);
 }

@@ -7,12 +7,13 @@
 #include "common/trace.h"
 
 /// Trace the rays of the W paths of work item `item`; returns how many rays had bounced.
-inline uint trace_paths(__global const Params *params, __global Float *path, GEOMETRY_PARAMETERS)
+inline uint trace_paths(__global const Params *params, __global Float *path, GEOMETRY_BUFFERS)
 {
     const UInt status = get_u(path, PATH_STATUS);
     const Mask alive = (status & STATUS_MASK) == STATUS_ALIVE;
     if (!any_lane(alive))
         return 0;
+    DEFINE_RAY_SEEDS(path, (status & DEPTH_MASK) * 2u);
     const Hits hits = closest_hits(params, alive, get_v(path, PATH_ORIGIN_X), get_v(path, PATH_DIRECTION_X),
                                    GEOMETRY_ARGUMENTS);
     put_u(path, PATH_HIT_TRIANGLE, hits.triangle);
@@ -30,13 +31,13 @@ kernel void intersect_closest(
     __global const Params *params,
     __global float *pool,
     volatile __global uint *counters,
-    GEOMETRY_PARAMETERS)
+    GEOMETRY_BUFFERS)
 {
     const uint first = get_global_id(0) * RUN;
     const uint end = min(first + RUN, params->slots / W);
     uint bounced = 0;
     for (uint item = first; item < end; ++item)
-        bounced += trace_paths(params, pool_at(pool, item), GEOMETRY_ARGUMENTS);
+        bounced += trace_paths(params, pool_at(pool, item), GEOMETRY_BUFFER_ARGUMENTS);
     if (bounced > 0)
         atomic_add(&counters[COUNTER_PENDING_BOUNCE], bounced);
 }

@@ -8,6 +8,7 @@
 #include "common/alpha.h"
 #include "common/surface.h"
 #include "common/bsdf.h"
+#include "common/material.h"
 #include "common/light.h"
 #include "common/sharing.h"
 
@@ -77,13 +78,10 @@ kernel void shade_paths(
 #if SMOOTH
     __global const Normals *normals,
 #endif
-    __global const Material *materials,
-#if TEXTURES
-    __global const Uvs *uvs,
-    __global const TextureInfo *textures,
-    __global const uchar4 *texels,
-    __global const float *srgb_to_linear,
+#if TANGENTS
+    __global const Tangents *tangents,
 #endif
+    __global const Material *materials TEXTURE_PARAMETERS COLOR_PARAMETERS,
 #if CONNECT
     __global const Light *lights,
 #endif
@@ -135,27 +133,25 @@ kernel void shade_paths(
     const UInt triangle = pick_u(hit, hit_triangle, (UInt)(0u));
     const Float u = FIELD(path, PATH_HIT_U);
     const Float v = FIELD(path, PATH_HIT_V);
-    const SurfacePoint s = surface_point(triangle, u, v, wo, surfaces
+    SurfacePoint s = surface_point(triangle, u, v, wo, surfaces
 #if SMOOTH
-                                         , normals
+                                   , normals
 #endif
     );
 
 #if AREA_LIGHTS
     const UInt flags = GATHER_U(materials, s.material, flags);
-    const Mask emits =
-        hit & (s.light != NO_LIGHT) & (s.front | ((flags & MATERIAL_TWO_SIDED_EMISSION) != 0u));
+    const Mask gives = (s.light != NO_LIGHT) | ((flags & MATERIAL_UNLIT) != 0u);
+    const Mask emits = hit & gives & (s.front | ((flags & MATERIAL_TWO_SIDED_EMISSION) != 0u));
     if (any_lane(emits)) {
-        Vec3 emission = vec3(GATHER(materials, s.material, emission[0]), GATHER(materials, s.material, emission[1]),
-                             GATHER(materials, s.material, emission[2]));
-#if TEXTURES
-        emission = textured(emits, emission, GATHER_U(materials, s.material, emission_texture), triangle, u, v,
-                            uvs, textures, texels, srgb_to_linear);
-#endif
+        const Vec3 emission =
+            fetch_emission(emits, s, u, v, materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS);
 #if CONNECT
-        const UInt light = pick_u(emits, s.light, (UInt)(0u));
-        const Float pdf_light =
+        const Mask sampled = emits & (s.light != NO_LIGHT);
+        const UInt light = pick_u(sampled, s.light, (UInt)(0u));
+        Float pdf_light =
             area_light_density(lights, light, FIELD(path, PATH_HIT_T), fabs(dot3(s.ng, wo)));
+        pdf_light = pick(sampled, pdf_light, (Float)(0.0f));
 #else
         const Float pdf_light = (Float)(0.0f);
 #endif
@@ -184,24 +180,12 @@ kernel void shade_paths(
     put_v(path, PATH_DIRECT_R, add(get_v(path, PATH_DIRECT_R), pick_v(depth <= 1u, brought, zero)));
 #endif
 
-    Bsdf b;
-    b.base_color = vec3(GATHER(materials, s.material, base_color[0]), GATHER(materials, s.material, base_color[1]),
-                        GATHER(materials, s.material, base_color[2]));
-#if TEXTURES
-    b.base_color = textured(hit, b.base_color, GATHER_U(materials, s.material, base_color_texture), triangle, u,
-                            v, uvs, textures, texels, srgb_to_linear);
+#if TANGENTS
+    Vec3 tangent;
+    Vec3 bitangent;
+    map_normal(hit, &s, u, v, wo, materials, tangents TEXTURE_ARGUMENTS, &tangent, &bitangent);
 #endif
-#if GLOSSY
-    b.metallic = GATHER(materials, s.material, metallic);
-    b.alpha = max(GATHER(materials, s.material, alpha_ggx), ALPHA_GGX_MIN);
-    b.f0 = GATHER(materials, s.material, f0);
-    b.specular = GATHER(materials, s.material, specular);
-#endif
-#if TRANSMISSION
-    b.transmission = GATHER(materials, s.material, transmission);
-    const Float ior = GATHER(materials, s.material, ior);
-    b.eta = pick(s.front, ior, 1.0f / ior);
-#endif
+    const Bsdf b = fetch_bsdf(hit, s, u, v, materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS);
 
     const UInt sample = get_u(path, PATH_SAMPLE);
     const UInt pixel = get_u(path, PATH_PIXEL);
@@ -219,9 +203,11 @@ kernel void shade_paths(
         return;
     }
 
+#if !TANGENTS
     Vec3 tangent;
     Vec3 bitangent;
     make_frame(s.ns, &tangent, &bitangent);
+#endif
     const Vec3 wo_local = vec3(dot3(tangent, wo), dot3(bitangent, wo), max(dot3(s.ns, wo), (Float)(1e-6f)));
     const LobeChances chances = lobe_chances(b, wo_local.z);
 
@@ -255,10 +241,8 @@ kernel void shade_paths(
     if (params->light_count > 0u) {
         const Float away = s.offset;
         const Vec3 above = add_scaled(s.p, s.ng, away);
-        const LightSample light = sample_light(params, lights, surfaces, materials,
-#if TEXTURES
-                                               uvs, textures, texels, srgb_to_linear,
-#endif
+        const LightSample light = sample_light(params, lights, surfaces,
+                                               materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS,
 #if ENVIRONMENT == 2
                                                environment,
 #endif

@@ -12,11 +12,20 @@ from psf_cl.device import layout
 from psf_cl.errors import InputError
 from psf_cl.image import AOVS
 from psf_cl.measure.timing import Declared
-from psf_cl.scene.model import Scene, emits, has_environment, is_cut_out, shines
+from psf_cl.scene.model import (
+    TEXTURE_FIELDS,
+    Scene,
+    emits,
+    has_environment,
+    has_layers,
+    has_tangents,
+    is_cut_out,
+    shines,
+)
 from psf_cl.settings import Settings
 from psf_cl.stages import camera, cells, connect, film, intersect, shade
 from psf_cl.stages.spec import BufferSpec, Context, Feature, StageSpec
-from psf_cl.tables import few_triangles, flatten, visible_shapes
+from psf_cl.tables import distinct_images, few_triangles, flatten, visible_shapes
 from psf_cl.traits import DeviceTraits
 
 #: Bytes that the passes in flight may take before the ring is made shorter.
@@ -167,7 +176,7 @@ def make_plan(
         corner_count=corners,
         material_count=len(scene.materials),
         texture_count=len(scene.textures),
-        texel_count=sum(texture.pixels.size // 4 for texture in scene.textures),
+        texel_count=sum(image.size // 4 for image in distinct_images(scene.textures)),
         environment_count=image.shape[0] * image.shape[1]
         if image is not None and features["ENVIRONMENT"].value == 2
         else 0,
@@ -241,17 +250,33 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
     def switch(value: bool, yes: str, no: str) -> Feature:
         return Feature(int(value), yes if value else no)
 
-    textured = any(
-        m.base_color_texture >= 0 or (emits(m) and m.emission_texture >= 0) for m in materials
-    )
+    textured = any(getattr(m, name) >= 0 for m in materials for name in TEXTURE_FIELDS)
+    cut_out = any(is_cut_out(scene.materials[shape.material], shape.mesh) for shape in shapes)
+    blended = cut_out and any(m.alpha_mode == "blend" for m in materials)
+    glows = any(emits(m) or m.unlit for m in materials)
     glossy = any(m.metallic > 0.0 or m.specular > 0.0 or m.transmission > 0.0 for m in materials)
     feature_aovs = outputs & {"albedo", "normal", "depth"}
     return {
-        "TEXTURES": switch(textured, "a material has a texture", "no material has a texture"),
-        "ALPHA": switch(
-            any(is_cut_out(m) for m in materials),
-            "a material is cut out by its alpha",
-            "no material is cut out",
+        "TEXTURES": switch(
+            textured or cut_out,
+            "a material has a texture" if textured else "alpha is looked up as a texture's",
+            "no material has a texture",
+        ),
+        "ALPHA": Feature(
+            (2 if blended else 1) if cut_out else 0,
+            ("a material blends" if blended else "a material is cut out by its alpha")
+            if cut_out
+            else "no material is cut out",
+        ),
+        "VERTEX_COLORS": switch(
+            any(shape.mesh.colors is not None for shape in shapes),
+            "a mesh has colours",
+            "no mesh has colours",
+        ),
+        "TANGENTS": switch(
+            any(has_tangents(m) for m in materials),
+            "a material has a normal map or is anisotropic",
+            "no material has a normal map or is anisotropic",
         ),
         "SMOOTH": switch(
             any(shape.mesh.normals is not None for shape in shapes),
@@ -259,6 +284,11 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "no mesh has shading normals",
         ),
         "GLOSSY": switch(
+            any(
+                (m.metallic > 0.0 or m.specular > 0.0 or m.transmission > 0.0 or has_layers(m))
+                and not m.unlit
+                for m in materials
+            ),
             glossy,
             "a material has a coat or is a metal",
             "every material is matt",
@@ -268,7 +298,12 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "a material lets light through",
             "no material lets light through",
         ),
-        "AREA_LIGHTS": switch(any(emits(m) for m in materials), "a shape emits", "no shape emits"),
+        "LAYERS": switch(
+            any(has_layers(m) for m in materials),
+            "a material has a clear coat, sheen, anisotropy or a coloured reflection",
+            "no material has a clear coat, sheen, anisotropy or a coloured reflection",
+        ),
+        "AREA_LIGHTS": switch(glows, "a shape emits", "no shape emits"),
         "PUNCTUAL_LIGHTS": switch(
             bool(lights),
             f"{len(lights)} lights without extent",
@@ -363,13 +398,26 @@ def _scene_buffers(context: Context, scene: Scene) -> tuple[BufferSpec, ...]:
         buffers.append(BufferSpec("normals", layout.NORMALS.dtype, triangles, "shading normals"))
     if context.on("TEXTURES"):
         buffers += [
-            BufferSpec("uvs", layout.UVS.dtype, triangles, "texture coordinates"),
+            BufferSpec(
+                "uvs",
+                layout.UVS.dtype,
+                triangles * (1 + any(texture.uv_set for texture in scene.textures)),
+                "texture coordinates",
+            ),
             BufferSpec(
                 "textures", layout.TEXTURE.dtype, context.texture_count, "where textures lie"
             ),
             BufferSpec("texels", uint8, 4 * max(context.texel_count, 1), "texels of all textures"),
             BufferSpec("srgb_to_linear", float32, 256, "decoding table"),
         ]
+    if context.on("VERTEX_COLORS"):
+        buffers.append(
+            BufferSpec("colors", layout.VERTEX_COLORS.dtype, triangles, "colours of the corners")
+        )
+    if context.on("TANGENTS"):
+        buffers.append(
+            BufferSpec("tangents", layout.TANGENTS.dtype, triangles, "where u grows on the surface")
+        )
     if context.on("CONNECT"):
         buffers.append(BufferSpec("lights", layout.LIGHT.dtype, lights, "light table"))
     if context.features["ENVIRONMENT"].value == 2:

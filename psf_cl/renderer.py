@@ -24,7 +24,7 @@ from psf_cl.image import Image
 from psf_cl.measure.errors import error_of_halves
 from psf_cl.plan import Plan, make_plan
 from psf_cl.scene.load import load_scene
-from psf_cl.scene.model import Scene, is_cut_out
+from psf_cl.scene.model import Scene
 from psf_cl.scheduler import Hooks, Progress, Scheduler
 from psf_cl.settings import Settings, resolve
 from psf_cl.stages import cells, film
@@ -384,10 +384,12 @@ class Renderer:
         scene, planned = self.scene, {spec.name for spec in self.plan.scene_buffers}
         geometry = tables.flatten(scene)
         lights, environment_pmf = tables.light_table(scene, geometry, self.settings.light_sampling)
-        textures, texels = tables.texture_tables(scene.textures if "textures" in planned else ())
+        textures, texels = tables.texture_tables(
+            scene.textures if "textures" in planned else (), geometry.count
+        )
         few = None
         if self.plan.features["FEW"].value:
-            few = tables.few_triangles(geometry.positions, self._cut_out(geometry))
+            few = tables.few_triangles(geometry.positions, geometry.cut_out)
         self.dropped_triangles = few.dropped if few else 0
 
         def or_zeros(table: np.ndarray | None, record: layout.Record) -> np.ndarray:
@@ -401,6 +403,12 @@ class Renderer:
             "materials": lambda: tables.material_table(scene.materials),
             "normals": lambda: or_zeros(geometry.normals, layout.NORMALS),
             "uvs": lambda: or_zeros(geometry.uvs, layout.UVS),
+            "colors": lambda: (
+                np.ones(geometry.count, layout.VERTEX_COLORS.dtype)
+                if geometry.colors is None
+                else geometry.colors
+            ),
+            "tangents": lambda: or_zeros(geometry.tangents, layout.TANGENTS),
             "textures": lambda: textures,
             "texels": lambda: texels.reshape(-1),
             "srgb_to_linear": tables.srgb_to_linear,
@@ -457,17 +465,12 @@ class Renderer:
             params[0][name] = value
         return params
 
-    def _cut_out(self, geometry: tables.Geometry) -> np.ndarray:
-        """Return which triangles' alpha must be looked up, ``(n,)`` bool."""
-        cut_out = np.array([is_cut_out(m) for m in self.scene.materials], bool)
-        return cut_out[geometry.surfaces["material"]]
-
     def _build_bvh(self, geometry: tables.Geometry) -> Bvh:
         device = self.device
         inputs = [device.upload("positions", geometry.positions.reshape(-1))]
         try:
             if self.plan.features["ALPHA"].value:
-                flags = self._cut_out(geometry).astype(np.uint32)
+                flags = geometry.cut_out.astype(np.uint32)
                 inputs.append(device.upload("alpha_flags", flags))
             bvh = build_bvh(device, inputs[0], geometry.count, *inputs[1:])
         finally:

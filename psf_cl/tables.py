@@ -11,15 +11,18 @@ from psf_cl.device import layout
 from psf_cl.errors import InputError
 from psf_cl.scene.model import (
     LUMINANCE,
+    TEXTURE_FIELDS,
     Camera,
     Environment,
     Light,
     Material,
+    Mesh,
     Scene,
     Shape,
     Texture,
     emits,
     has_environment,
+    has_tangents,
     is_cut_out,
     is_invisible,
     shines,
@@ -42,7 +45,11 @@ class Geometry:
         positions: ``(n, 9)`` float32, the three corners; m.
         surfaces: ``(n,)`` layout.SURFACE, ``light`` still NO_LIGHT.
         normals: ``(n,)`` layout.NORMALS, or None if every shape is flat.
-        uvs: ``(n,)`` layout.UVS, or None if nothing has coordinates.
+        uvs: ``(n,)`` layout.UVS, or None if nothing has coordinates; ``(2 * n,)``, the second
+            set behind the first, if a texture uses it.
+        colors: ``(n,)`` layout.VERTEX_COLORS, or None if no mesh has colours.
+        tangents: ``(n,)`` layout.TANGENTS, or None if no material asks for them.
+        cut_out: ``(n,)`` bool, whether hits must look up their alpha.
         radius: of a sphere around all finite vertices; m.
     """
 
@@ -50,6 +57,9 @@ class Geometry:
     surfaces: np.ndarray
     normals: np.ndarray | None
     uvs: np.ndarray | None
+    colors: np.ndarray | None
+    tangents: np.ndarray | None
+    cut_out: np.ndarray
     radius: float
 
     @property
@@ -64,12 +74,16 @@ def visible_shapes(scene: Scene) -> list[Shape]:
 
 def flatten(scene: Scene) -> Geometry:
     """Return the triangles of all visible shapes, in the order of the shapes."""
-    positions, surfaces, normals, uvs = [], [], [], []
+    positions, surfaces, normals, cut_out = [], [], [], []
+    uvs: tuple[list[np.ndarray], ...] = ([], [])
+    colors, tangents = [], []
     shapes = visible_shapes(scene)
     smooth = any(shape.mesh.normals is not None for shape in shapes)
-    mapped = any(shape.mesh.uvs is not None for shape in shapes)
+    mapped = any(shape.mesh.uvs is not None or shape.mesh.uvs1 is not None for shape in shapes)
+    colored = any(shape.mesh.colors is not None for shape in shapes)
+    directed = any(has_tangents(scene.materials[shape.material]) for shape in shapes)
     for shape in shapes:
-        mesh = shape.mesh
+        mesh, material = shape.mesh, scene.materials[shape.material]
         linear = shape.transform[:3, :3]
         with np.errstate(
             all="ignore"
@@ -87,22 +101,30 @@ def flatten(scene: Scene) -> Geometry:
         surface["offset"] = OFFSET_EPSILON * _extent(surface)
         positions.append(corners.reshape(-1, 9))
         surfaces.append(surface)
+        cut_out.append(np.full(len(corners), is_cut_out(material, mesh)))
         if smooth:
-            record = np.zeros(len(corners), layout.NORMALS.dtype)
+            world_normals = None
             if mesh.normals is not None:
-                for corner, name in enumerate(("n0", "n1", "n2")):
-                    record[name] = _world_normals(mesh.normals, linear)[mesh.triangles[:, corner]]
-            normals.append(record)
+                world_normals = _world_normals(mesh.normals, linear)
+            normals.append(_corner_records(layout.NORMALS, "n", world_normals, mesh, 0.0))
         if mapped:
-            record = np.zeros(len(corners), layout.UVS.dtype)
-            if mesh.uvs is not None:
-                for corner, name in enumerate(("uv0", "uv1", "uv2")):
-                    record[name] = mesh.uvs[mesh.triangles[:, corner]]
-            uvs.append(record)
+            for part, values in zip(uvs, (mesh.uvs, mesh.uvs1), strict=True):
+                part.append(_corner_records(layout.UVS, "uv", values, mesh, 0.0))
+        if colored:
+            colors.append(_corner_records(layout.VERTEX_COLORS, "c", mesh.colors, mesh, 1.0))
+        if directed:
+            record = np.zeros(len(corners), layout.TANGENTS.dtype)
+            if has_tangents(material):
+                for name, values in zip(
+                    ("t0", "t1", "t2"), _world_tangents(scene, shape), strict=True
+                ):
+                    record[name] = values
+            tangents.append(record)
 
     def joined(parts: list[np.ndarray], dtype: np.dtype, width: tuple[int, ...] = ()) -> np.ndarray:
         return np.concatenate(parts) if parts else np.zeros((0, *width), dtype)
 
+    second = any(texture.uv_set for texture in scene.textures)
     points = joined(positions, np.dtype(np.float32), (9,))
     finite = points[np.isfinite(points).all(axis=1)].reshape(-1, 3).astype(np.float64)
     low, high = (
@@ -112,9 +134,84 @@ def flatten(scene: Scene) -> Geometry:
         points,
         joined(surfaces, layout.SURFACE.dtype),
         joined(normals, layout.NORMALS.dtype) if smooth else None,
-        joined(uvs, layout.UVS.dtype) if mapped else None,
+        joined([*uvs[0], *(uvs[1] if second else [])], layout.UVS.dtype) if mapped else None,
+        joined(colors, layout.VERTEX_COLORS.dtype) if colored else None,
+        joined(tangents, layout.TANGENTS.dtype) if directed else None,
+        joined(cut_out, np.dtype(bool)),
         float(np.linalg.norm(high - low)) / 2,
     )
+
+
+def _corner_records(
+    record: layout.Record, stem: str, values: np.ndarray | None, mesh: Mesh, otherwise: float
+) -> np.ndarray:
+    """Return the values of each triangle's vertices in the fields ``stem`` 0, 1, 2, ``(m,)``."""
+    table = np.zeros(len(mesh.triangles), record.dtype)
+    for corner in range(3):
+        known = otherwise if values is None else values[mesh.triangles[:, corner]]
+        table[f"{stem}{corner}"] = known
+    return table
+
+
+def _world_tangents(scene: Scene, shape: Shape) -> list[np.ndarray]:
+    """Return direction and sign at each triangle's corners, three times ``(m, 4)``.
+
+    Those of the mesh, or derived from the coordinates of the normal map: zero where there are none.
+    """
+    mesh, material = shape.mesh, scene.materials[shape.material]
+    linear = shape.transform[:3, :3]
+    if mesh.tangents is not None:
+        at_corners = [mesh.tangents[mesh.triangles[:, corner]] for corner in range(3)]
+    else:
+        index = max(material.normal_texture, material.anisotropy_texture)
+        texture = scene.textures[index] if index >= 0 else None
+        uvs = mesh.uvs1 if texture is not None and texture.uv_set else mesh.uvs
+        if uvs is None:
+            return [np.zeros((len(mesh.triangles), 4))] * 3
+        if texture is not None:
+            matrix = np.reshape(texture.transform, (2, 3))
+            uvs = uvs @ matrix[:, :2].T
+        at_corners = derived_tangents(mesh, uvs)
+    sign = -1.0 if np.linalg.det(linear) < 0 else 1.0
+    world = []
+    for values in at_corners:
+        with np.errstate(all="ignore"):
+            direction = values[:, :3] @ linear.T
+            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        direction[~np.isfinite(direction).all(axis=1)] = 0.0
+        world.append(np.column_stack([direction, values[:, 3] * sign]))
+    return world
+
+
+def derived_tangents(mesh: Mesh, uvs: np.ndarray) -> list[np.ndarray]:
+    """Return tangent and sign at each triangle's corners, in the mesh's space, three ``(m, 4)``.
+
+    As in Mikkelsen's MikkTSpace, which glTF asks for: the directions in which u grows over the
+    triangles around a vertex, weighted by their angles; triangles whose coordinates are mirrored
+    are averaged apart.
+
+    Args:
+        uvs: ``(n, 2)``, transformed.
+    """
+    points = mesh.positions.astype(np.float64)[mesh.triangles]
+    at = uvs.astype(np.float64)[mesh.triangles]
+    with np.errstate(all="ignore"):
+        e1, e2 = points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]
+        d1, d2 = at[:, 1] - at[:, 0], at[:, 2] - at[:, 0]
+        area = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
+        # glTF's v grows downwards: the bitangent is where it falls, so the sign turns.
+        sign = np.where(area < 0, 1.0, -1.0)
+        tangent = (e1 * d2[:, 1:] - e2 * d1[:, 1:]) * np.sign(area)[:, None]
+        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+        tangent[~np.isfinite(tangent).all(axis=1)] = 0.0
+        sums = np.zeros((2 * len(mesh.positions), 3))
+        keys = 2 * mesh.triangles.astype(np.int64) + (sign < 0)[:, None]
+        for corner in range(3):
+            a = points[:, (corner + 1) % 3] - points[:, corner]
+            b = points[:, (corner + 2) % 3] - points[:, corner]
+            angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1))
+            np.add.at(sums, keys[:, corner], tangent * np.nan_to_num(angle)[:, None])
+    return [np.column_stack([sums[keys[:, corner]], sign]) for corner in range(3)]
 
 
 def _front_normals(surface: np.ndarray, mirrored: bool) -> np.ndarray:
@@ -188,32 +285,44 @@ def few_triangles(positions: np.ndarray, cut_out: np.ndarray | None = None) -> F
 def material_table(materials: tuple[Material, ...]) -> np.ndarray:
     """Return ``(n,)`` layout.MATERIAL."""
     table = np.zeros(len(materials), layout.MATERIAL.dtype)
-    none = layout.CONSTANT["NO_TEXTURE"]
     for row, material in zip(table, materials, strict=True):
+        for name in table.dtype.names or ():
+            if name in TEXTURE_FIELDS:
+                index = getattr(material, name)
+                row[name] = index if index >= 0 else layout.CONSTANT["NO_TEXTURE"]
+            elif hasattr(material, name):
+                row[name] = getattr(material, name)
+        row["f0"] = ((material.ior - 1) / (material.ior + 1)) ** 2
         # An index of exactly 1 has no boundary to bend at: the half vector would vanish.
-        ior = material.ior if abs(material.ior - 1.0) > 1e-3 else 1.001
-        row["base_color"] = material.base_color
-        row["metallic"] = material.metallic
-        row["emission"] = material.emission
-        row["alpha_ggx"] = material.roughness**2
-        row["f0"] = ((material.ior - 1) / (material.ior + 1)) ** 2 * material.specular
-        row["specular"] = material.specular
-        row["ior"] = ior
-        row["transmission"] = material.transmission
-        row["base_color_texture"] = (
-            material.base_color_texture if material.base_color_texture >= 0 else none
-        )
-        row["emission_texture"] = (
-            material.emission_texture if material.emission_texture >= 0 else none
-        )
-        flags = layout.CONSTANT["MATERIAL_TWO_SIDED_EMISSION"] if material.double_sided else 0
-        if is_cut_out(material):
-            flags |= layout.CONSTANT["MATERIAL_ALPHA_MASK"]
-        row["flags"] = flags
-        row["alpha_cutoff"] = (
-            material.alpha_cutoff / material.alpha if material.alpha > 0 else np.inf
-        )
+        row["ior"] = material.ior if abs(material.ior - 1.0) > 1e-3 else 1.001
+        row["absorption"] = absorption(material)
+        angle = material.anisotropy_rotation
+        row["anisotropy_direction"] = math.cos(angle), math.sin(angle)
+        flags = {
+            "MATERIAL_TWO_SIDED_EMISSION": material.double_sided or material.unlit,
+            "MATERIAL_ALPHA_MASK": material.alpha_mode == "mask",
+            "MATERIAL_ALPHA_BLEND": material.alpha_mode == "blend",
+            "MATERIAL_UNLIT": material.unlit,
+            "MATERIAL_THIN": material.thin_walled,
+        }
+        row["flags"] = sum(layout.CONSTANT[name] for name, value in flags.items() if value)
+        if material.unlit:
+            # A black surface that glows in its colour; the texture stays, for its alpha.
+            row["emission"] = material.base_color
+            row["emission_texture"] = row["base_color_texture"]
+            for name in ("base_color", "metallic", "f0", "specular", "transmission", "clearcoat"):
+                row[name] = 0.0
+            row["sheen_color"] = 0.0
     return table
+
+
+def absorption(material: Material) -> np.ndarray:
+    """Return how much of the light inside is lost per meter, ``(3,)``: Beer's law.
+
+    A colour of 0 takes all but e^-30 over the distance.
+    """
+    left = np.maximum(material.attenuation_color, 1e-13)
+    return np.minimum(-np.log(left) / material.attenuation_distance, 1e30)
 
 
 def srgb_to_linear() -> np.ndarray:
@@ -224,17 +333,24 @@ def srgb_to_linear() -> np.ndarray:
     )
 
 
-def texture_tables(textures: tuple[Texture, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``(n,)`` layout.TEXTURE and all texels, ``(m, 4)`` uint8."""
+def texture_tables(
+    textures: tuple[Texture, ...], triangle_count: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``(n,)`` layout.TEXTURE and all texels, ``(m, 4)`` uint8; an image lies there once.
+
+    Args:
+        triangle_count: of the scene: where the second set of coordinates begins.
+    """
     table = np.zeros(max(len(textures), 1), layout.TEXTURE.dtype)
     table["width"] = table["height"] = 1
     bits = {
         "clamp": ("TEXTURE_CLAMP_U", "TEXTURE_CLAMP_V"),
         "mirror": ("TEXTURE_MIRROR_U", "TEXTURE_MIRROR_V"),
     }
-    texels, offset = [], 0
+    images = distinct_images(textures)
+    starts = np.cumsum([0, *(image.size // 4 for image in images)])
+    offsets = {id(image): start for image, start in zip(images, starts, strict=False)}
     for row, texture in zip(table, textures, strict=False):
-        height, width = texture.pixels.shape[:2]
         flags = 0
         for axis, wrap in enumerate(texture.wrap):
             if wrap in bits:
@@ -243,10 +359,17 @@ def texture_tables(textures: tuple[Texture, ...]) -> tuple[np.ndarray, np.ndarra
             flags |= layout.CONSTANT["TEXTURE_NEAREST"]
         if texture.srgb:
             flags |= layout.CONSTANT["TEXTURE_SRGB"]
-        row["offset"], row["width"], row["height"], row["flags"] = offset, width, height, flags
-        texels.append(texture.pixels.reshape(-1, 4))
-        offset += width * height
+        row["height"], row["width"] = texture.pixels.shape[:2]
+        row["offset"], row["flags"] = offsets[id(texture.pixels)], flags
+        row["matrix"] = texture.transform
+        row["uv_offset"] = triangle_count * texture.uv_set
+    texels = [image.reshape(-1, 4) for image in images]
     return table, np.concatenate(texels) if texels else np.full((1, 4), 255, np.uint8)
+
+
+def distinct_images(textures: tuple[Texture, ...]) -> list[np.ndarray]:
+    """Return the pixels of all textures, each array once."""
+    return list({id(texture.pixels): texture.pixels for texture in textures}.values())
 
 
 def alias_table(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

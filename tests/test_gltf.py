@@ -505,22 +505,78 @@ def test_every_factor_arrives(tmp_path: Path) -> None:
     assert material.double_sided
 
 
-def test_blending_becomes_a_mask_and_is_said(tmp_path: Path) -> None:
-    scene = with_material(alphaMode="BLEND", alphaCutoff=0.9).load(tmp_path)
-    assert scene.materials[0].alpha_mode == "mask"
-    assert scene.materials[0].alpha_cutoff == 0.5
-    assert any("blending" in note for note in scene.notes)
+def test_blending_and_unlit_are_read(tmp_path: Path) -> None:
+    scene = with_material(
+        alphaMode="BLEND",
+        pbrMetallicRoughness={"baseColorFactor": [1, 1, 1, 0.25]},
+        extensions={"KHR_materials_unlit": {}},
+    ).load(tmp_path)
+    material = scene.materials[0]
+    assert (material.alpha_mode, material.alpha, material.unlit) == ("blend", 0.25, True)
+    assert not scene.notes
 
 
 def test_what_is_not_rendered_is_said(tmp_path: Path) -> None:
     scene = with_material(
-        normalTexture={"index": 0},
-        pbrMetallicRoughness={"metallicRoughnessTexture": {"index": 0}},
-        extensions={"KHR_materials_unlit": {}, "KHR_materials_sheen": {}},
+        occlusionTexture={"index": 0},
+        extensions={
+            "KHR_materials_clearcoat": {"clearcoatNormalTexture": {"index": 0}},
+            "KHR_materials_iridescence": {},
+        },
     ).load(tmp_path)
     said = " ".join(scene.notes)
-    for name in ("normalTexture", "metallicRoughnessTexture", "KHR_materials_unlit", "sheen"):
+    for name in ("occlusionTexture", "clearcoatNormalTexture", "KHR_materials_iridescence"):
         assert name in said
+
+
+EXTENSIONS = {
+    "KHR_materials_clearcoat": {"clearcoatFactor": 0.5, "clearcoatRoughnessFactor": 0.25},
+    "KHR_materials_sheen": {"sheenColorFactor": [1, 0.5, 0], "sheenRoughnessFactor": 0.75},
+    "KHR_materials_anisotropy": {"anisotropyStrength": 0.5, "anisotropyRotation": 1.5},
+    "KHR_materials_specular": {"specularFactor": 0.5, "specularColorFactor": [0, 0.5, 1]},
+    "KHR_materials_transmission": {"transmissionFactor": 0.5},
+    "KHR_materials_volume": {
+        "thicknessFactor": 2.0,
+        "attenuationDistance": 0.5,
+        "attenuationColor": [1, 0.5, 0.25],
+    },
+    "KHR_materials_ior": {"ior": 1.25},
+}
+
+
+def test_every_extension_of_materials_is_read(tmp_path: Path) -> None:
+    scene = with_material(extensions=EXTENSIONS).load(tmp_path)
+    material = scene.materials[0]
+    expected = {
+        "clearcoat": 0.5,
+        "clearcoat_roughness": 0.25,
+        "sheen_color": (1.0, 0.5, 0.0),
+        "sheen_roughness": 0.75,
+        "anisotropy": 0.5,
+        "anisotropy_rotation": 1.5,
+        "specular": 0.5,
+        "specular_color": (0.0, 0.5, 1.0),
+        "transmission": 0.5,
+        "thin_walled": False,
+        "attenuation_distance": 0.5,
+        "attenuation_color": (1.0, 0.5, 0.25),
+        "ior": 1.25,
+    }
+    assert {name: getattr(material, name) for name in expected} == expected
+    assert not scene.notes
+
+
+def test_glass_without_a_thickness_is_a_thin_wall(tmp_path: Path) -> None:
+    scene = with_material(
+        extensions={"KHR_materials_transmission": {"transmissionFactor": 1.0}}
+    ).load(tmp_path)
+    assert scene.materials[0].thin_walled
+
+
+def test_an_attenuation_distance_of_0_is_refused(tmp_path: Path) -> None:
+    extensions = {"KHR_materials_volume": {"attenuationDistance": 0.0}}
+    with pytest.raises(InputError, match="attenuationDistance: expected a number above 0"):
+        with_material(extensions=extensions).load(tmp_path)
 
 
 def test_only_used_materials_are_kept_and_equal_uses_shared(
@@ -574,11 +630,62 @@ def test_textures_are_one_for_each_image_and_sampler_in_use(
     assert clamped.pixels is plain.pixels
 
 
-def test_a_texture_of_other_coordinates_is_ignored_and_said(tmp_path: Path) -> None:
-    builder = with_material(pbrMetallicRoughness={"baseColorTexture": {"index": 0, "texCoord": 1}})
+def test_a_texture_of_a_third_set_of_coordinates_is_ignored_and_said(tmp_path: Path) -> None:
+    builder = with_material(pbrMetallicRoughness={"baseColorTexture": {"index": 0, "texCoord": 2}})
     scene = builder.load(tmp_path)
     assert scene.materials[0].base_color_texture == -1
-    assert any("TEXCOORD_0" in note for note in scene.notes)
+    assert any("TEXCOORD_1" in note for note in scene.notes)
+
+
+def test_textures_have_their_encoding_coordinates_and_transform(tmp_path: Path) -> None:
+    change = {"offset": [0.5, 0.25], "rotation": math.pi / 2, "scale": [2, 3], "texCoord": 1}
+    builder = with_material(
+        pbrMetallicRoughness={
+            "baseColorTexture": {"index": 0},
+            "metallicRoughnessTexture": {
+                "index": 0,
+                "extensions": {"KHR_texture_transform": change},
+            },
+        },
+        normalTexture={"index": 0, "texCoord": 1, "scale": 0.5},
+    )
+    builder.add(
+        "textures", source=builder.add("images", bufferView=builder.view(png((1, 2, 3, 4))))
+    )
+    scene = builder.load(tmp_path)
+    material = scene.materials[0]
+    base, rough, normal = (
+        scene.textures[index]
+        for index in (
+            material.base_color_texture,
+            material.metallic_roughness_texture,
+            material.normal_texture,
+        )
+    )
+    assert (base.srgb, base.uv_set, base.transform) == (True, 0, (1, 0, 0, 0, 1, 0))
+    assert (normal.srgb, normal.uv_set, material.normal_scale) == (False, 1, 0.5)
+    assert (rough.srgb, rough.uv_set) == (False, 1)
+    # A quarter turn counter-clockwise with v growing downwards: u becomes -v, v becomes u.
+    np.testing.assert_allclose(rough.transform, (0, 3, 0.5, -2, 0, 0.25), atol=1e-12)
+    assert base.pixels is rough.pixels is normal.pixels
+
+
+def test_colours_second_coordinates_and_tangents_of_vertices_are_read(
+    builder: Builder, tmp_path: Path
+) -> None:
+    colors = np.array([[0, 51, 255], [255, 0, 0], [0, 0, 0]], np.uint8)
+    uvs = np.arange(6, dtype=np.float32).reshape(3, 2)
+    tangents = np.tile(np.array([[1, 0, 0, -1]], np.float32), (3, 1))
+    mesh = builder.mesh(
+        COLOR_0=builder.accessor(colors, "u1", normalized=True),
+        TEXCOORD_1=builder.accessor(uvs),
+        TANGENT=builder.accessor(tangents),
+    )
+    builder.node(mesh=mesh)
+    read = builder.load(tmp_path).shapes[0].mesh
+    np.testing.assert_allclose(read.colors, np.c_[colors / 255.0, np.ones(3)], atol=1e-6)
+    np.testing.assert_array_equal(read.uvs1, uvs)
+    np.testing.assert_array_equal(read.tangents, tangents)
 
 
 def test_an_unreadable_texture_in_use_is_one_error(tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ PARTS = {
     "ALPHA": (
         FLAT_QUAD,
         LOW,
-        lambertian(0.5, base_color_texture=0, alpha=0.2, alpha_mode="mask"),
+        lambertian(0.5, base_color_texture=0, alpha_cutoff=0.6, alpha_mode="mask"),
     ),
     "SMOOTH": (primitives.sphere(5, 4), LIFTED, lambertian(0.5)),
     "GLOSSY": (FLAT_QUAD, LIFTED, Material()),

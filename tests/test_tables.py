@@ -127,15 +127,15 @@ def test_materials_become_their_parameters():
     gone = Material(base_color_texture=0, alpha_mode="mask", alpha=0.0)
     a, b, c, d, e = tables.material_table((plain, lamp, cut, air, gone))
     np.testing.assert_allclose(a["base_color"], (0.1, 0.2, 0.3), rtol=1e-6)
-    assert a["alpha_ggx"] == np.float32(0.25)
-    assert a["f0"] == np.float32(0.02) and a["specular"] == np.float32(0.5)
+    assert a["roughness"] == np.float32(0.5)
+    assert a["f0"] == np.float32(0.04) and a["specular"] == np.float32(0.5)
     assert a["base_color_texture"] == a["emission_texture"] == none and a["flags"] == 0
     np.testing.assert_array_equal(b["emission"], (1, 2, 3))
     assert b["emission_texture"] == 1 and b["flags"] == CONSTANT["MATERIAL_TWO_SIDED_EMISSION"]
     assert c["flags"] == CONSTANT["MATERIAL_ALPHA_MASK"] and c["base_color_texture"] == 0
-    assert c["alpha_cutoff"] == np.float32(0.5) and c["transmission"] == 1
+    assert c["alpha_cutoff"] == 0.25 and c["alpha"] == 0.5 and c["transmission"] == 1
     assert d["f0"] == 0 and d["ior"] > 1
-    assert e["alpha_cutoff"] == np.inf and e["flags"] == CONSTANT["MATERIAL_ALPHA_MASK"]
+    assert e["alpha"] == 0 and e["flags"] == CONSTANT["MATERIAL_ALPHA_MASK"]
 
 
 def test_only_masks_that_can_fail_are_cut_out():

@@ -34,7 +34,8 @@ def make_textures():
     for k, (wrap_u, wrap_v, kind, srgb) in enumerate(kinds):
         height, width = [(3, 5), (4, 4), (1, 7), (6, 1), (1, 1)][k % 5]
         pixels = rng.integers(0, 256, (height, width, 4), np.uint8)
-        textures.append(Texture(f"{k}", pixels, srgb, (wrap_u, wrap_v), kind))
+        matrix = tuple(rng.uniform(-1.5, 1.5, 6))
+        textures.append(Texture(f"{k}", pixels, srgb, (wrap_u, wrap_v), kind, k % 2, matrix))
     return tuple(textures)
 
 
@@ -79,7 +80,7 @@ def look_up(texture, u, v):
 @pytest.fixture
 def textured(lane_device):
     """Return a function that runs a kernel over TEXTURES."""
-    records, texels = tables.texture_tables(TEXTURES)
+    records, texels = tables.texture_tables(TEXTURES, triangle_count=50)
     buffers = {
         "textures": lane_device.upload("textures", records),
         "texels": lane_device.upload("texels", texels.reshape(-1)),
@@ -153,9 +154,10 @@ def test_every_srgb_code_is_decoded():
 def test_points_of_triangles_are_multiplied_by_their_texture(textured, lane_device):
     rng = np.random.default_rng(2)
     count = 4096
-    uvs = np.zeros(50, layout.UVS.dtype)
+    # Fifty triangles with two sets of coordinates each.
+    uvs = np.zeros(100, layout.UVS.dtype)
     for name in ("uv0", "uv1", "uv2"):
-        uvs[name] = rng.uniform(0, 1, (50, 2))
+        uvs[name] = rng.uniform(0, 1, (100, 2))
     linear = [k for k, t in enumerate(TEXTURES) if t.filter == "linear"]
     index = rng.choice([*linear, CONSTANT["NO_TEXTURE"]], count).astype(np.uint32)
     triangle = rng.integers(0, 50, count, np.uint32)
@@ -173,11 +175,13 @@ def test_points_of_triangles_are_multiplied_by_their_texture(textured, lane_devi
     found = textured("color_points", inputs, 3, uvs=buffer)
     lane_device.release(buffer)
     u, v = barycentrics.astype(np.float64)[..., None]
-    at = uvs[triangle]
-    uv = (1 - u - v) * at["uv0"] + u * at["uv1"] + v * at["uv2"]
     expected = color.T.astype(np.float64)
     for k in np.flatnonzero(mask & (index != CONSTANT["NO_TEXTURE"])):
-        expected[k] *= look_up(TEXTURES[index[k]], *uv[k])[:3]
+        texture = TEXTURES[index[k]]
+        at = uvs[triangle[k] + 50 * texture.uv_set]
+        uv = (1 - u[k] - v[k]) * at["uv0"] + u[k] * at["uv1"] + v[k] * at["uv2"]
+        place = np.reshape(texture.transform, (2, 3)) @ (*uv, 1.0)
+        expected[k] *= look_up(texture, *place)[:3]
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-5)
 
 

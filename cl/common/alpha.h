@@ -1,34 +1,66 @@
-// Cut-out surfaces: whether a hit is really there.  Include before traverse.h.
+// Surfaces that are there in part: masks, and blending by chance.  Include before traverse.h.
+//
+// With blending (ALPHA 2) a ray has a seed, and the random number of a hit is a function of that and the
+// triangle: the same whatever else the ray meets, in whatever order.
 #pragma once
 
 #include "lanes.h"
+#include "rng.h"
 #include "texture.h"
 
 #if ALPHA
 
-#define ALPHA_PARAMETERS                                                                           \
-    , __global const Surface *surfaces, __global const Material *materials,                        \
-        __global const Uvs *uvs, __global const TextureInfo *textures,                             \
-        __global const uchar4 *texels, __global const float *srgb_to_linear
-#define ALPHA_ARGUMENTS , surfaces, materials, uvs, textures, texels, srgb_to_linear
+// What a kernel needs for it; functions also need the seeds of their rays.
+#define ALPHA_BUFFERS                                                                              \
+    , __global const Surface *surfaces,                                                            \
+        __global const Material *materials TEXTURE_PARAMETERS COLOR_PARAMETERS
+#define ALPHA_BUFFER_ARGUMENTS , surfaces, materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS
+#if ALPHA == 2
+#define ALPHA_PARAMETERS ALPHA_BUFFERS, const uint *ray_seeds
+#define ALPHA_ARGUMENTS ALPHA_BUFFER_ARGUMENTS, ray_seeds
+#define ALPHA_ARGUMENTS_OF(lane) ALPHA_BUFFER_ARGUMENTS, ray_seeds + (lane)
+#else
+#define ALPHA_PARAMETERS ALPHA_BUFFERS
+#define ALPHA_ARGUMENTS ALPHA_BUFFER_ARGUMENTS
+#define ALPHA_ARGUMENTS_OF(lane) ALPHA_ARGUMENTS
+#endif
 
-/// Whether the alpha of the triangle at barycentrics (u, v) reaches its material's cutoff.
+/// Opacity of a triangle at barycentrics (u, v).
+inline float opacity(
+    __global const Material *material, uint triangle, float u, float v TEXTURE_PARAMETERS COLOR_PARAMETERS)
+{
+    float alpha = material->alpha;
+#if VERTEX_COLORS
+    alpha *= (1.0f - u - v) * colors[triangle].c0[3] + u * colors[triangle].c1[3] + v * colors[triangle].c2[3];
+#endif
+    const uint texture = material->base_color_texture;
+    if (texture != NO_TEXTURE)
+        alpha *= look_up_on_triangle(uvs, textures, texels, srgb_to_linear, texture, triangle, u, v).w;
+    return alpha;
+}
+
+/// Whether a hit on the triangle at barycentrics (u, v) is there.
 inline int alpha_passes(uint triangle, float u, float v ALPHA_PARAMETERS)
 {
     __global const Material *material = &materials[surfaces[triangle].material];
-    if (material->base_color_texture == NO_TEXTURE)
-        return 1;
-    const float2 uv = triangle_uv(uvs, triangle, u, v);
-    const float4 texel =
-        look_up_texture(textures, texels, srgb_to_linear, material->base_color_texture, uv.x, uv.y);
-    return texel.w >= material->alpha_cutoff;
+    const float alpha = opacity(material, triangle, u, v TEXTURE_ARGUMENTS COLOR_ARGUMENTS);
+#if ALPHA == 2
+    if (material->flags & MATERIAL_ALPHA_BLEND) {
+        // The mixer of rng.h, for one lane.
+        uint x = *ray_seeds ^ triangle * 0x9e3779b9u;
+        x = (x ^ (x >> 16)) * 0x7feb352du;
+        x = (x ^ (x >> 15)) * 0x846ca68bu;
+        return (float)((x ^ (x >> 16)) >> 8) * 5.9604645e-8f < alpha;
+    }
+#endif
+    return alpha >= material->alpha_cutoff;
 }
 
-/// The same for the lanes of `mask`, true also where the material is not cut out.
+/// The same for the lanes of `mask`, true also where the material is opaque.
 inline Mask alpha_passes_lanes(Mask mask, UInt triangle, Float u, Float v ALPHA_PARAMETERS)
 {
     const UInt material = GATHER_U(surfaces, triangle, material);
-    mask &= (GATHER_U(materials, material, flags) & MATERIAL_ALPHA_MASK) != 0u;
+    mask &= (GATHER_U(materials, material, flags) & (MATERIAL_ALPHA_MASK | MATERIAL_ALPHA_BLEND)) != 0u;
     if (!any_lane(mask))
         return MASK_ALL;
     float wanted[W];
@@ -41,10 +73,46 @@ inline Mask alpha_passes_lanes(Mask mask, UInt triangle, Float u, Float v ALPHA_
     store_lanes(u, lane_u);
     store_lanes(v, lane_v);
     for (uint k = 0; k < W; ++k)
-        there[k] = wanted[k] == 0.0f || alpha_passes(id[k], lane_u[k], lane_v[k] ALPHA_ARGUMENTS);
+        there[k] = wanted[k] == 0.0f || alpha_passes(id[k], lane_u[k], lane_v[k] ALPHA_ARGUMENTS_OF(k));
     return load_lanes(there) != 0.0f;
 }
+
+/// Share of the light that points of the lanes of `mask` block or give: 0 or 1 for a mask.
+inline Float alpha_share(Mask mask, UInt triangle, Float u, Float v ALPHA_BUFFERS)
+{
+    const UInt material = GATHER_U(surfaces, triangle, material);
+    const UInt flags = GATHER_U(materials, material, flags);
+    mask &= (flags & (MATERIAL_ALPHA_MASK | MATERIAL_ALPHA_BLEND)) != 0u;
+    if (!any_lane(mask))
+        return (Float)(1.0f);
+    Float alpha;
+    look_up_lanes(mask, GATHER_U(materials, material, base_color_texture), triangle, u, v TEXTURE_ARGUMENTS,
+                  &alpha);
+    alpha *= GATHER(materials, material, alpha);
+#if VERTEX_COLORS
+    alpha *= (1.0f - u - v) * GATHER(colors, triangle, c0[3]) + u * GATHER(colors, triangle, c1[3])
+             + v * GATHER(colors, triangle, c2[3]);
+#endif
+    const Mask there = alpha >= GATHER(materials, material, alpha_cutoff);
+    alpha = pick((flags & MATERIAL_ALPHA_MASK) != 0u, pick(there, (Float)(1.0f), (Float)(0.0f)), alpha);
+    return pick(mask, alpha, (Float)(1.0f));
+}
+
 #else
+#define ALPHA_BUFFERS
+#define ALPHA_BUFFER_ARGUMENTS
 #define ALPHA_PARAMETERS
 #define ALPHA_ARGUMENTS
+#define ALPHA_ARGUMENTS_OF(lane)
+#endif
+
+// Before rays are traced: seeds of the paths' rays number `number`, if a hit may be left to chance.
+#if ALPHA == 2
+#define DEFINE_RAY_SEEDS(path, number)                                                             \
+    uint ray_seeds[W];                                                                             \
+    store_lanes_u(mix_bits(get_u(path, PATH_SEED)                                                  \
+                           ^ mix_bits(get_u(path, PATH_SAMPLE) * 0x9e3779b9u + (number))),         \
+                  ray_seeds)
+#else
+#define DEFINE_RAY_SEEDS(path, number)
 #endif

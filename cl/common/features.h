@@ -8,7 +8,13 @@
 #error "TEXTURES must be 0 or 1"
 #endif
 #ifndef ALPHA
-#error "ALPHA must be 0 or 1"
+#error "ALPHA must be 0 (none), 1 (masks) or 2 (also blending)"
+#endif
+#ifndef VERTEX_COLORS
+#error "VERTEX_COLORS must be 0 or 1"
+#endif
+#ifndef TANGENTS
+#error "TANGENTS must be 0 or 1"
 #endif
 #ifndef SMOOTH
 #error "SMOOTH must be 0 or 1"
@@ -18,6 +24,9 @@
 #endif
 #ifndef TRANSMISSION
 #error "TRANSMISSION must be 0 or 1"
+#endif
+#ifndef LAYERS
+#error "LAYERS must be 0 or 1"
 #endif
 #ifndef AREA_LIGHTS
 #error "AREA_LIGHTS must be 0 or 1"

@@ -7,7 +7,10 @@
 #define NO_LIGHT 0xFFFFFFFFu
 #define NO_TEXTURE 0xFFFFFFFFu
 #define MATERIAL_TWO_SIDED_EMISSION 1u
-#define MATERIAL_ALPHA_MASK 2u
+#define MATERIAL_ALPHA_MASK 2u // hits must look up the alpha
+#define MATERIAL_ALPHA_BLEND 4u // with a chance of alpha a hit is there
+#define MATERIAL_UNLIT 8u // what it emits is its base colour; it is no light
+#define MATERIAL_THIN 16u // a sheet of glass: light goes through unbent
 #define TEXTURE_CLAMP_U 1u
 #define TEXTURE_MIRROR_U 2u
 #define TEXTURE_CLAMP_V 4u
@@ -213,28 +216,66 @@ typedef struct {
     float pad[2]; // fills the record
 } Uvs;
 
-/// Parameters of the one BSDF.
+/// Colours of a triangle's corners; they multiply the base colour.
+typedef struct {
+    float c0[4]; // linear Rec.709 and alpha
+    float c1[4]; // linear Rec.709 and alpha
+    float c2[4]; // linear Rec.709 and alpha
+} VertexColors;
+
+/// Directions of growing u at a triangle's corners; all zero if it has none.
+typedef struct {
+    float t0[4]; // unit, world; then 1 or -1: the bitangent is that times normal x tangent
+    float t1[4]; // unit, world; the same
+    float t2[4]; // unit, world; the same
+} Tangents;
+
+/// Parameters of the one BSDF; textures are indices, NO_TEXTURE for none.
 typedef struct {
     float base_color[3]; // linear Rec.709
     float metallic; // 0 dielectric, 1 metal
     float emission[3]; // radiance
-    float alpha_ggx; // roughness squared
-    float f0; // dielectric reflectance at normal incidence times specular
-    float specular; // F90 of the dielectric; 0 for pure diffuse
+    float roughness; // its square is the alpha of GGX
+    float f0; // dielectric reflectance at normal incidence, before the specular strength
+    float specular; // strength of the dielectric reflection; 0 for pure diffuse
     float ior; // index of refraction
     float transmission; // 0 opaque, 1 glass
-    uint base_color_texture; // index, NO_TEXTURE for none
-    uint emission_texture; // index, NO_TEXTURE for none
-    uint flags; // MATERIAL_TWO_SIDED_EMISSION, MATERIAL_ALPHA_MASK
-    float alpha_cutoff; // of the mask, divided by the alpha factor
+    uint base_color_texture; // colour and alpha
+    uint emission_texture; // colour
+    uint metallic_roughness_texture; // roughness in green, metallic in blue
+    uint flags; // MATERIAL_* bits
+    float alpha; // opacity, before textures
+    float alpha_cutoff; // least opacity that is there, of a mask
+    uint normal_texture; // tangent space
+    float normal_scale; // of its x and y
+    float absorption[3]; // per m, inside
+    uint transmission_texture; // red
+    float specular_color[3]; // linear Rec.709; tints the dielectric reflection
+    uint specular_texture; // alpha
+    uint specular_color_texture; // colour
+    float clearcoat; // strength of the coat
+    float clearcoat_roughness; // its square is the alpha of GGX
+    uint clearcoat_texture; // red
+    float sheen_color[3]; // linear Rec.709
+    float sheen_roughness; // its square is the alpha of the Charlie distribution
+    uint clearcoat_roughness_texture; // green
+    uint sheen_color_texture; // colour
+    uint sheen_roughness_texture; // alpha
+    float anisotropy; // 0 to 1
+    float anisotropy_direction[2]; // cosine and sine of the rotation from the tangent
+    uint anisotropy_texture; // direction in red and green, strength in blue
+    float pad[5]; // fills the cache line
 } Material;
 
-/// Where a texture's texels are.
+/// Where a texture's texels are, and how coordinates come to them.
 typedef struct {
     uint offset; // first texel
     uint width; // texels
     uint height; // texels
     uint flags; // TEXTURE_* bits: wrap of u and v, nearest, sRGB
+    float matrix[6]; // rows of the transform of (u, v, 1)
+    uint uv_offset; // to be added to a triangle's index, for its set of coordinates
+    uint pad; // fills the record
 } TextureInfo;
 
 /// An emitter of the light table, with all that sampling it needs; two cache lines.

@@ -133,13 +133,7 @@ LARGE_FUNCTION LightSample sample_light(
     __global const Params *params,
     __global const Light *lights,
     __global const Surface *surfaces,
-    __global const Material *materials,
-#if TEXTURES
-    __global const Uvs *uvs,
-    __global const TextureInfo *textures,
-    __global const uchar4 *texels,
-    __global const float *srgb_to_linear,
-#endif
+    __global const Material *materials TEXTURE_PARAMETERS COLOR_PARAMETERS,
 #if ENVIRONMENT == 2
     __global const EnvironmentCell *cells,
 #endif
@@ -191,16 +185,16 @@ LARGE_FUNCTION LightSample sample_light(
         const Vec3 wi = normalize3(toward);
         const Mask two_sided = (GATHER_U(lights, light, flags) & MATERIAL_TWO_SIDED_EMISSION) != 0u;
         const Float cosine = -dot3(ng, wi);
-        Mask lit = on_triangle & ((cosine > 0.0f) | two_sided) & (area > 0.0f);
-#if ALPHA
-        // Holes of a cut-out emitter give no light; the shadow ray ends before it could find that out.
-        lit &= alpha_passes_lanes(lit, triangle, b1, b2 ALPHA_ARGUMENTS);
-#endif
+        const Mask lit = on_triangle & ((cosine > 0.0f) | two_sided) & (area > 0.0f);
         Vec3 emission = vec3(GATHER(lights, light, intensity[0]), GATHER(lights, light, intensity[1]),
                              GATHER(lights, light, intensity[2]));
 #if TEXTURES
         emission = textured(lit, emission, GATHER_U(lights, light, emission_texture), triangle, b1,
-                            b2, uvs, textures, texels, srgb_to_linear);
+                            b2 TEXTURE_ARGUMENTS);
+#endif
+#if ALPHA
+        // Holes of an emitter give no light; the shadow ray ends before it could find that out.
+        emission = scale(emission, alpha_share(lit, triangle, b1, b2 ALPHA_BUFFER_ARGUMENTS));
 #endif
         const Float pdf = pmf * dot3(toward, toward) / max(fabs(cosine) * area, 1e-30f);
         s.toward = pick_v(lit, toward, s.toward);

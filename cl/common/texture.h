@@ -4,6 +4,26 @@
 #include "lanes.h"
 #include "layout.h"
 
+// What a function needs to look textures up, or to pass that on.
+#if TEXTURES || ALPHA
+#define TEXTURE_PARAMETERS                                                                         \
+    , __global const Uvs *uvs, __global const TextureInfo *textures,                               \
+        __global const uchar4 *texels, __global const float *srgb_to_linear
+#define TEXTURE_ARGUMENTS , uvs, textures, texels, srgb_to_linear
+#else
+#define TEXTURE_PARAMETERS
+#define TEXTURE_ARGUMENTS
+#endif
+
+// The same for the colours of corners.
+#if VERTEX_COLORS
+#define COLOR_PARAMETERS , __global const VertexColors *colors
+#define COLOR_ARGUMENTS , colors
+#else
+#define COLOR_PARAMETERS
+#define COLOR_ARGUMENTS
+#endif
+
 /// Texel index along one axis, wrapped into [0, size).
 inline uint wrap_texel(int i, int size, int clamped, int mirrored)
 {
@@ -144,17 +164,61 @@ LARGE_FUNCTION Vec3 look_up_textures(
     return color;
 }
 
-/// Texture coordinates of a point of a triangle.
-inline float2 triangle_uv(__global const Uvs *uvs, uint triangle, float u, float v)
+/// Colour and alpha of texture `index` at a point of a triangle.
+inline float4 look_up_on_triangle(
+    __global const Uvs *uvs,
+    __global const TextureInfo *textures,
+    __global const uchar4 *texels,
+    __global const float *srgb_to_linear,
+    uint index,
+    uint triangle,
+    float u,
+    float v)
 {
-    const Uvs c = uvs[triangle];
+    __global const TextureInfo *info = &textures[index];
+    const Uvs c = uvs[triangle + info->uv_offset];
     const float w = 1.0f - u - v;
-    return (float2)(w * c.uv0[0] + u * c.uv1[0] + v * c.uv2[0],
-                    w * c.uv0[1] + u * c.uv1[1] + v * c.uv2[1]);
+    const float s = w * c.uv0[0] + u * c.uv1[0] + v * c.uv2[0];
+    const float t = w * c.uv0[1] + u * c.uv1[1] + v * c.uv2[1];
+    __global const float *m = info->matrix;
+    return look_up_texture(textures, texels, srgb_to_linear, index, m[0] * s + m[1] * t + m[2],
+                           m[3] * s + m[4] * t + m[5]);
+}
+
+/// Colour and alpha of a texture in the lanes of `mask`; all 1 elsewhere and for NO_TEXTURE.
+LARGE_FUNCTION Vec3 look_up_lanes(
+    Mask mask,
+    UInt texture,
+    UInt triangle,
+    Float u,
+    Float v,
+    __global const Uvs *uvs,
+    __global const TextureInfo *textures,
+    __global const uchar4 *texels,
+    __global const float *srgb_to_linear,
+    Float *alpha)
+{
+    *alpha = (Float)(1.0f);
+    mask &= texture != NO_TEXTURE;
+    if (!any_lane(mask))
+        return vec3_all((Float)(1.0f));
+    const UInt index = pick_u(mask, texture, (UInt)(0u));
+    const UInt at = pick_u(mask, triangle + GATHER_U(textures, index, uv_offset), (UInt)(0u));
+    const Float w = 1.0f - u - v;
+    const Float s = w * GATHER(uvs, at, uv0[0]) + u * GATHER(uvs, at, uv1[0]) + v * GATHER(uvs, at, uv2[0]);
+    const Float t = w * GATHER(uvs, at, uv0[1]) + u * GATHER(uvs, at, uv1[1]) + v * GATHER(uvs, at, uv2[1]);
+    const Float x = GATHER(textures, index, matrix[0]) * s + GATHER(textures, index, matrix[1]) * t
+                    + GATHER(textures, index, matrix[2]);
+    const Float y = GATHER(textures, index, matrix[3]) * s + GATHER(textures, index, matrix[4]) * t
+                    + GATHER(textures, index, matrix[5]);
+    Float found_alpha;
+    const Vec3 color = look_up_textures(textures, texels, srgb_to_linear, index, x, y, &found_alpha);
+    *alpha = pick(mask, found_alpha, (Float)(1.0f));
+    return pick_v(mask, color, vec3_all((Float)(1.0f)));
 }
 
 /// Multiply `color` by a texture in the lanes of `mask`; `texture` may be NO_TEXTURE.
-LARGE_FUNCTION Vec3 textured(
+inline Vec3 textured(
     Mask mask,
     Vec3 color,
     UInt texture,
@@ -166,15 +230,20 @@ LARGE_FUNCTION Vec3 textured(
     __global const uchar4 *texels,
     __global const float *srgb_to_linear)
 {
-    mask &= texture != NO_TEXTURE;
-    if (!any_lane(mask))
-        return color;
-    const UInt at = pick_u(mask, triangle, (UInt)(0u));
-    const Float w = 1.0f - u - v;
-    const Float x = w * GATHER(uvs, at, uv0[0]) + u * GATHER(uvs, at, uv1[0]) + v * GATHER(uvs, at, uv2[0]);
-    const Float y = w * GATHER(uvs, at, uv0[1]) + u * GATHER(uvs, at, uv1[1]) + v * GATHER(uvs, at, uv2[1]);
     Float alpha;
-    const Vec3 c =
-        look_up_textures(textures, texels, srgb_to_linear, pick_u(mask, texture, (UInt)(0u)), x, y, &alpha);
-    return mul(color, pick_v(mask, c, vec3_all((Float)(1.0f))));
+    return mul(color, look_up_lanes(mask, texture, triangle, u, v, uvs, textures, texels, srgb_to_linear, &alpha));
 }
+
+#if VERTEX_COLORS
+/// Colour at a point of a triangle.
+inline Vec3 corner_color(UInt triangle, Float u, Float v, __global const VertexColors *colors)
+{
+    const Float w = 1.0f - u - v;
+    return vec3(w * GATHER(colors, triangle, c0[0]) + u * GATHER(colors, triangle, c1[0])
+                    + v * GATHER(colors, triangle, c2[0]),
+                w * GATHER(colors, triangle, c0[1]) + u * GATHER(colors, triangle, c1[1])
+                    + v * GATHER(colors, triangle, c2[1]),
+                w * GATHER(colors, triangle, c0[2]) + u * GATHER(colors, triangle, c1[2])
+                    + v * GATHER(colors, triangle, c2[2]));
+}
+#endif

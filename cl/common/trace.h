@@ -1,6 +1,6 @@
 // The rays of all lanes through the scene: a tree, or every triangle where there are FEW.
 //
-// GEOMETRY_PARAMETERS are what a kernel needs for it.
+// GEOMETRY_BUFFERS are what a kernel needs for it; before it calls, it says DEFINE_RAY_SEEDS.
 #pragma once
 
 #include "lanes.h"
@@ -10,13 +10,16 @@
 #include "traverse.h"
 
 #if FEW
-#define GEOMETRY_PARAMETERS __global const float *corners, __global const uint *faces ALPHA_PARAMETERS
-#define GEOMETRY_ARGUMENTS corners, faces ALPHA_ARGUMENTS
+#define TRIANGLE_BUFFERS __global const float *corners, __global const uint *faces
+#define TRIANGLE_ARGUMENTS corners, faces
 #else
-#define GEOMETRY_PARAMETERS                                                                        \
-    __global const BvhNode *nodes, __global const TriangleBlock *blocks ALPHA_PARAMETERS
-#define GEOMETRY_ARGUMENTS nodes, blocks ALPHA_ARGUMENTS
+#define TRIANGLE_BUFFERS __global const BvhNode *nodes, __global const TriangleBlock *blocks
+#define TRIANGLE_ARGUMENTS nodes, blocks
 #endif
+#define GEOMETRY_BUFFERS TRIANGLE_BUFFERS ALPHA_BUFFERS
+#define GEOMETRY_BUFFER_ARGUMENTS TRIANGLE_ARGUMENTS ALPHA_BUFFER_ARGUMENTS
+#define GEOMETRY_ARGUMENTS TRIANGLE_ARGUMENTS ALPHA_ARGUMENTS
+#define GEOMETRY_PARAMETERS TRIANGLE_BUFFERS ALPHA_PARAMETERS
 
 /// Return what the rays of the lanes in `active` hit first; the others hit nothing.
 inline Hits closest_hits(

@@ -17,6 +17,9 @@
 #error "STACK_SIZE must be that of the tree: 7 entries a level and one more"
 #endif
 
+#ifndef ALPHA_ARGUMENTS_OF
+#define ALPHA_ARGUMENTS_OF(lane) ALPHA_ARGUMENTS
+#endif
 #if ALPHA
 #define IS_THERE(id, u, v)                                                                         \
     (((id) & ALPHA_BIT) == 0 || alpha_passes((id) & ~ALPHA_BIT, (u), (v) ALPHA_ARGUMENTS))
@@ -290,7 +293,7 @@ static inline Hits trace_closest(
         // Index 0 loses every tie, so that t_max itself is out of range.
         best.triangle = 0;
         if (ray.t_max > 0.0f)
-            trace_closest_from(nodes, blocks, &ray, 0, &best ALPHA_ARGUMENTS);
+            trace_closest_from(nodes, blocks, &ray, 0, &best ALPHA_ARGUMENTS_OF(k));
         t[k] = best.t;
         u[k] = best.u;
         v[k] = best.v;
@@ -328,7 +331,7 @@ static inline Mask trace_any(
                 const uint k = lowest_bit(lanes);
                 lanes &= lanes - 1u;
                 const RaySetup ray = ray_setup(rays, k);
-                if (trace_any_from(nodes, blocks, &ray, next ALPHA_ARGUMENTS)) {
+                if (trace_any_from(nodes, blocks, &ray, next ALPHA_ARGUMENTS_OF(k))) {
                     blocked |= 1u << k;
                     left &= ~(1u << k);
                 }

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -40,21 +41,24 @@ from psf_cl.scene.model import (
     limited,
 )
 from psf_cl.scene.texture import decode_pixels
-from psf_cl.scene.transform import rotation_quaternion, without_scale
+from psf_cl.scene.transform import rotation_quaternion, uv_rows, without_scale
 
 # A file may list these as required; anything else required is refused.
 SUPPORTED = (
     "EXT_texture_webp",
     "KHR_lights_punctual",
+    "KHR_materials_anisotropy",
+    "KHR_materials_clearcoat",
     "KHR_materials_emissive_strength",
     "KHR_materials_ior",
+    "KHR_materials_sheen",
     "KHR_materials_specular",
     "KHR_materials_transmission",
     "KHR_materials_unlit",
+    "KHR_materials_volume",
     "KHR_mesh_quantization",
+    "KHR_texture_transform",
 )
-# Known so well that lit surfaces are an acceptable substitute, but not followed.
-_SUBSTITUTED = ("KHR_materials_unlit",)
 
 # Nodes times primitives can be far more than the file's size suggests.
 MAX_SHAPES = 1 << 20
@@ -93,7 +97,7 @@ class _Reader:
     shapes: list[Shape] = field(default_factory=list)
     materials: dict[int | None, int] = field(default_factory=dict)
     material_list: list[Material] = field(default_factory=list)
-    textures: dict[tuple[int, tuple[str, str], str], int] = field(default_factory=dict)
+    textures: dict[tuple[Any, ...], int] = field(default_factory=dict)
     texture_list: list[Texture] = field(default_factory=list)
     pixels: dict[int, np.ndarray] = field(default_factory=dict)
     meshes: dict[int, list[tuple[Mesh, int | None]]] = field(default_factory=dict)
@@ -114,7 +118,7 @@ class _Reader:
             self.notes["animations are left out: nodes stay where the file puts them"] += 1
         if not self.shapes:
             self.notes["the default scene has no triangles"] += 1
-        ignored = sorted(self.extensions.difference(SUPPORTED) | self.extensions & {*_SUBSTITUTED})
+        ignored = sorted(self.extensions.difference(SUPPORTED))
         if ignored:
             self.notes[f"extensions are ignored: {', '.join(ignored)}"] += 1
         height = Scene.height
@@ -293,14 +297,25 @@ class _Reader:
             self.notes["primitives without POSITION are left out"] += 1
             return None
         normals = self.gltf.accessor(attributes, "NORMAL", "VEC3", QUANTISED_OR_FLOAT)
-        uvs = self.gltf.accessor(attributes, "TEXCOORD_0", "VEC2", QUANTISED_OR_FLOAT)
-        for key, values in (("NORMAL", normals), ("TEXCOORD_0", uvs)):
+        uvs, uvs1 = (
+            self.gltf.accessor(attributes, key, "VEC2", QUANTISED_OR_FLOAT)
+            for key in ("TEXCOORD_0", "TEXCOORD_1")
+        )
+        tangents = self.gltf.accessor(attributes, "TANGENT", "VEC4", QUANTISED_OR_FLOAT)
+        colors = self._colors(attributes)
+        of_vertices = {
+            "NORMAL": normals,
+            "TEXCOORD_0": uvs,
+            "TEXCOORD_1": uvs1,
+            "TANGENT": tangents,
+            "COLOR_0": colors,
+        }
+        for key, values in of_vertices.items():
             if values is not None and len(values) != len(positions):
                 expected = f"as many elements as POSITION, {len(positions)}"
                 attributes.fail(key, expected, str(len(values)))
-        for key in ("COLOR_0", "JOINTS_0"):
-            if key in attributes:
-                self.notes[f"the vertex attribute {key} is ignored"] += 1
+        if "JOINTS_0" in attributes:
+            self.notes["the vertex attribute JOINTS_0 is ignored"] += 1
         if primitive.length("targets"):
             self.notes["morph targets are left out: meshes keep their base form"] += 1
         triangles = self._triangles(primitive, mode, len(positions))
@@ -313,13 +328,32 @@ class _Reader:
             # Primitives often share one large vertex buffer: keep what each needs.
             triangles = (np.cumsum(used) - 1)[triangles]
             positions = positions[used]
-            normals = None if normals is None else normals[used]
-            uvs = None if uvs is None else uvs[used]
+            normals, uvs, uvs1, tangents, colors = (
+                None if values is None else values[used]
+                for values in (normals, uvs, uvs1, tangents, colors)
+            )
         if normals is not None:
             normals = _unit_normals(normals, positions, triangles)
-        if uvs is not None:
-            uvs = np.where(np.isfinite(uvs), uvs, np.float32(0.0))
-        return Mesh(name, positions, triangles.astype(np.uint32), normals, uvs)
+        uvs, uvs1, tangents = (
+            None if values is None else np.where(np.isfinite(values), values, np.float32(0.0))
+            for values in (uvs, uvs1, tangents)
+        )
+        return Mesh(
+            name, positions, triangles.astype(np.uint32), normals, uvs, uvs1, colors, tangents
+        )
+
+    def _colors(self, attributes: Item) -> np.ndarray | None:
+        """Return the colours of the vertices, ``(n, 4)`` float32 in [0, 1]."""
+        if "COLOR_0" not in attributes:
+            return None
+        index = self.gltf.index(attributes, "COLOR_0", "accessors")
+        kind = self.gltf.root.element("accessors", index).text("type", "")
+        if kind not in ("VEC3", "VEC4"):
+            attributes.fail("COLOR_0", "an accessor of type VEC3 or VEC4", kind)
+        stored = self.gltf.accessor(attributes, "COLOR_0", kind, (5121, 5123, *FLOAT))
+        colors = np.ones((len(stored), 4), np.float32)
+        colors[:, : stored.shape[1]] = np.where(np.isfinite(stored), stored, np.float32(1.0))
+        return np.clip(colors, 0.0, 1.0)
 
     def _triangles(self, primitive: Item, mode: int, vertex_count: int) -> np.ndarray:
         """Return ``(m, 3)`` vertex indices, all below ``vertex_count``."""
@@ -373,10 +407,14 @@ class _Reader:
         empty = Item(item.file, "", {})
         self.extensions.update(item.extension_names())
         surface = item.item("pbrMetallicRoughness")
-        emissive = item.extension("KHR_materials_emissive_strength") or empty
-        refraction = item.extension("KHR_materials_ior") or empty
-        transmission = item.extension("KHR_materials_transmission") or empty
-        specular = item.extension("KHR_materials_specular") or empty
+
+        def extension(name: str) -> Item:
+            return item.extension(f"KHR_materials_{name}") or empty
+
+        emissive, refraction = extension("emissive_strength"), extension("ior")
+        transmission, volume = extension("transmission"), extension("volume")
+        specular, coat = extension("specular"), extension("clearcoat")
+        sheen, anisotropy = extension("sheen"), extension("anisotropy")
 
         base = surface.numbers("baseColorFactor", (1.0, 1.0, 1.0, 1.0), 0.0, 1.0)
         emission = item.numbers("emissiveFactor", (0.0, 0.0, 0.0), 0.0, 1.0)
@@ -384,54 +422,91 @@ class _Reader:
         alpha_mode = item.text("alphaMode", "OPAQUE")
         if alpha_mode not in ("OPAQUE", "MASK", "BLEND"):
             item.fail("alphaMode", "OPAQUE, MASK or BLEND")
-        cutoff = item.number("alphaCutoff", 0.5, 0.0)
-        if alpha_mode == "BLEND":
-            self.notes["alpha blending is replaced by a mask with cutoff 0.5"] += 1
-            cutoff = 0.5
         ior = refraction.number("ior", 1.5, 0.0)
         if 0.0 < ior < 1.0:
             refraction.fail("ior", "0, or a number of at least 1")
         if ior == 0.0:
             self.notes["an ior of 0 is taken as 1.5"] += 1
             ior = 1.5
+        distance = math.inf
+        if "attenuationDistance" in volume:
+            distance = volume.number("attenuationDistance", low=0.0)
+            if distance == 0.0:
+                volume.fail("attenuationDistance", "a number above 0")
         self._note_ignored(
-            (item, "normalTexture"),
-            (surface, "metallicRoughnessTexture"),
-            (transmission, "transmissionTexture"),
-            (specular, "specularTexture"),
-            (specular, "specularColorTexture"),
-            (specular, "specularColorFactor"),
+            (item, "occlusionTexture"),
+            (coat, "clearcoatNormalTexture"),
+            (volume, "thicknessTexture"),
         )
+        normal = item.item("normalTexture")
         return Material(
             item.text("name", "") or item.place,
             base_color=base[:3],
             base_color_texture=self._texture(surface, "baseColorTexture"),
             alpha=base[3],
-            alpha_mode="opaque" if alpha_mode == "OPAQUE" else "mask",
-            alpha_cutoff=cutoff,
+            alpha_mode=alpha_mode.lower(),
+            alpha_cutoff=item.number("alphaCutoff", 0.5, 0.0),
             metallic=surface.number("metallicFactor", 1.0, 0.0, 1.0),
             roughness=surface.number("roughnessFactor", 1.0, 0.0, 1.0),
+            metallic_roughness_texture=self._texture(
+                surface, "metallicRoughnessTexture", srgb=False
+            ),
             specular=specular.number("specularFactor", 1.0, 0.0, 1.0),
+            specular_texture=self._texture(specular, "specularTexture", srgb=False),
+            specular_color=self._specular_color(specular),
+            specular_color_texture=self._texture(specular, "specularColorTexture"),
             ior=ior,
             transmission=transmission.number("transmissionFactor", 0.0, 0.0, 1.0),
+            transmission_texture=self._texture(transmission, "transmissionTexture", srgb=False),
+            thin_walled=volume.number("thicknessFactor", 0.0, 0.0) == 0.0,
+            attenuation_color=volume.numbers("attenuationColor", (1.0, 1.0, 1.0), 0.0, 1.0),
+            attenuation_distance=distance,
+            clearcoat=coat.number("clearcoatFactor", 0.0, 0.0, 1.0),
+            clearcoat_texture=self._texture(coat, "clearcoatTexture", srgb=False),
+            clearcoat_roughness=coat.number("clearcoatRoughnessFactor", 0.0, 0.0, 1.0),
+            clearcoat_roughness_texture=self._texture(
+                coat, "clearcoatRoughnessTexture", srgb=False
+            ),
+            sheen_color=sheen.numbers("sheenColorFactor", (0.0, 0.0, 0.0), 0.0, 1.0),
+            sheen_color_texture=self._texture(sheen, "sheenColorTexture"),
+            sheen_roughness=sheen.number("sheenRoughnessFactor", 0.0, 0.0, 1.0),
+            sheen_roughness_texture=self._texture(sheen, "sheenRoughnessTexture", srgb=False),
+            anisotropy=anisotropy.number("anisotropyStrength", 0.0, 0.0, 1.0),
+            anisotropy_rotation=anisotropy.number("anisotropyRotation", 0.0),
+            anisotropy_texture=self._texture(anisotropy, "anisotropyTexture", srgb=False),
+            normal_texture=self._texture(item, "normalTexture", srgb=False),
+            normal_scale=normal.number("scale", 1.0),
             emission=self._limited(channel * strength for channel in emission),
             emission_texture=self._texture(item, "emissiveTexture") if any(emission) else -1,
             double_sided=item.flag("doubleSided"),
+            unlit=item.extension("KHR_materials_unlit") is not None,
         )
+
+    def _specular_color(self, specular: Item) -> tuple[float, ...]:
+        color = specular.numbers("specularColorFactor", (1.0, 1.0, 1.0), 0.0)
+        if max(color) > 1.0:
+            self.notes["specularColorFactor above 1 is taken as 1"] += 1
+        return tuple(min(channel, 1.0) for channel in color)
 
     def _note_ignored(self, *keys: tuple[Item, str]) -> None:
         for item, key in keys:
             if key in item:
                 self.notes[f"the material property {key} is ignored"] += 1
 
-    def _texture(self, owner: Item, key: str) -> int:
+    def _texture(self, owner: Item, key: str, srgb: bool = True) -> int:
         """Return the index in the scene of the texture that ``owner[key]`` uses, or -1 for none."""
         if key not in owner:
             return -1
         info = owner.item(key)
         self.extensions.update(info.extension_names())
-        if info.integer("texCoord", 0) != 0:
-            self.notes["textures with texture coordinates other than TEXCOORD_0 are ignored"] += 1
+        uv_set = info.integer("texCoord", 0)
+        matrix = Texture.transform
+        change = info.extension("KHR_texture_transform")
+        if change is not None:
+            uv_set = change.integer("texCoord", uv_set)
+            matrix = _texture_transform(change)
+        if uv_set > 1:
+            self.notes["textures with texture coordinates beyond TEXCOORD_1 are ignored"] += 1
             return -1
         texture_index = self.gltf.index(info, "index", "textures")
         if texture_index is None:
@@ -445,7 +520,7 @@ class _Reader:
             self.notes["textures without an image are ignored"] += 1
             return -1
         wrap, magnification = self._sampler(texture)
-        used = (image_index, wrap, magnification)
+        used = (image_index, srgb, wrap, magnification, uv_set, matrix)
         if used not in self.textures:
             image = self.gltf.root.element("images", image_index)
             name = image.text("name", "") or image.place
@@ -455,7 +530,9 @@ class _Reader:
                 self.notes["textures whose buffer has no data are ignored"] += 1
                 return -1
             self.textures[used] = len(self.texture_list)
-            self.texture_list.append(Texture(name, pixels, True, wrap, magnification))
+            self.texture_list.append(
+                Texture(name, pixels, srgb, wrap, magnification, uv_set, matrix)
+            )
         return self.textures[used]
 
     def _sampler(self, texture: Item) -> tuple[tuple[str, str], str]:
@@ -574,6 +651,13 @@ def _assemble_triangles(indices: np.ndarray, mode: int) -> np.ndarray:
         odd = first % 2
         return indices[np.stack([first, first + 1 + odd, first + 2 - odd], axis=1)]
     return indices[np.stack([first + 1, first + 2, first * 0], axis=1)]
+
+
+def _texture_transform(change: Item) -> tuple[float, ...]:
+    """Return the rows of the matrix that KHR_texture_transform describes."""
+    offset = change.numbers("offset", (0.0, 0.0))
+    scale = change.numbers("scale", (1.0, 1.0))
+    return uv_rows(offset, change.number("rotation", 0.0), scale)
 
 
 def _unit_normals(normals: np.ndarray, positions: np.ndarray, triangles: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from psf_cl.scene.environment import load_environment
 from psf_cl.scene.gltf import load_gltf
 from psf_cl.scene.model import (
     MAX_TRIANGLES,
+    TEXTURE_FIELDS,
     Camera,
     Environment,
     Material,
@@ -164,16 +165,19 @@ def _with_light(scene: Scene) -> Scene:
 def _without_unused(scene: Scene) -> Scene:
     """Return the scene without materials that no shape has and textures that nothing looks up."""
     kept = sorted({shape.material for shape in scene.shapes})
-    materials = [_without_dark_texture(scene.materials[index]) for index in kept]
-    fields = ("base_color_texture", "emission_texture")
-    order = sorted({getattr(material, name) for material in materials for name in fields} - {-1})
+    materials = [_without_idle_textures(scene.materials[index]) for index in kept]
+    used = {getattr(material, name) for material in materials for name in TEXTURE_FIELDS}
+    order = sorted(used - {-1})
     new_texture = {-1: -1} | {old: new for new, old in enumerate(order)}
     new_material = {old: new for new, old in enumerate(kept)}
     return replace(
         scene,
         textures=tuple(scene.textures[index] for index in order),
         materials=tuple(
-            replace(material, **{name: new_texture[getattr(material, name)] for name in fields})
+            replace(
+                material,
+                **{name: new_texture[getattr(material, name)] for name in TEXTURE_FIELDS},
+            )
             for material in materials
         ),
         shapes=tuple(
@@ -182,5 +186,21 @@ def _without_unused(scene: Scene) -> Scene:
     )
 
 
-def _without_dark_texture(material: Material) -> Material:
-    return material if emits(material) else replace(material, emission_texture=-1)
+def _without_idle_textures(material: Material) -> Material:
+    """Return ``material`` without the textures of what it has not."""
+    for strength, names in _TEXTURES_OF.items():
+        if not np.any(getattr(material, strength)):
+            material = replace(material, **dict.fromkeys(names, -1))
+    return material
+
+
+# A texture multiplies: where this is 0 those have no say.
+_TEXTURES_OF = {
+    "emission": ("emission_texture",),
+    "transmission": ("transmission_texture",),
+    "specular": ("specular_texture", "specular_color_texture"),
+    "clearcoat": ("clearcoat_texture", "clearcoat_roughness_texture"),
+    "sheen_color": ("sheen_color_texture", "sheen_roughness_texture"),
+    "anisotropy": ("anisotropy_texture",),
+    "normal_scale": ("normal_texture",),
+}

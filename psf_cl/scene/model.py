@@ -7,7 +7,7 @@ Every reader (TOML, glTF, OBJ, PLY, STL) fills these records and nothing else.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,8 @@ class Texture:
         srgb: whether the three colour channels are to be decoded from sRGB.
         wrap: how ``u`` and ``v`` leave [0, 1]: ``"repeat"``, ``"clamp"`` or ``"mirror"``.
         filter: ``"linear"`` or ``"nearest"``.
+        uv_set: 0 for ``Mesh.uvs``, 1 for ``Mesh.uvs1``.
+        transform: the first two rows of a matrix; it is looked up at ``transform @ (u, v, 1)``.
     """
 
     name: str
@@ -40,22 +42,42 @@ class Texture:
     srgb: bool = True
     wrap: tuple[str, str] = ("repeat", "repeat")
     filter: str = "linear"
+    uv_set: int = 0
+    transform: tuple[float, float, float, float, float, float] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Material:
     """Parameters of the one BSDF; the names are glTF's.
 
+    A ``..._texture`` is an index into ``Scene.textures``, -1 for none; it multiplies its parameter.
+    Strengths and roughnesses are from 0 to 1, colours linear RGB.
+
     Attributes:
-        base_color: linear RGB in [0, 1]; multiplied by ``base_color_texture`` where that is set.
-        base_color_texture, emission_texture: index into ``Scene.textures``; -1 for none.
-        alpha, alpha_cutoff: with ``alpha_mode == "mask"`` a point is there if
-            ``alpha * texture alpha >= alpha_cutoff``; ``"opaque"`` ignores both.
+        base_color: diffuse albedo, reflectance of a metal, or tint of what goes through.
+        base_color_texture: its alpha multiplies ``alpha``.
+        alpha, alpha_cutoff: with ``alpha_mode == "mask"`` a point is there if its alpha is at least
+            ``alpha_cutoff``; with ``"blend"`` it is there for that share of the light;
+            ``"opaque"`` ignores both.
+        metallic_roughness_texture: roughness in green, metallic in blue.
         roughness: GGX alpha is its square.
         specular: strength of the dielectric reflection; 0 makes a pure Lambertian surface.
-        transmission: 0 for opaque, 1 for glass.
-        emission: radiance (emissive factor times strength), multiplied by ``emission_texture``.
+        specular_color: tint of the dielectric reflection at normal incidence.
+        specular_texture: strength in alpha.
+        transmission: 0 for opaque, 1 for glass; texture in red.
+        thin_walled: whether the surface is a sheet: light that goes through is not bent.
+        attenuation_color, attenuation_distance: what is left of white light after that many meters
+            inside; never inside of a thin wall.
+        clearcoat: strength of a clear coat of index 1.5; textures in red, and green for its
+            roughness.
+        sheen_color, sheen_roughness: fuzz on top; the roughness' texture in alpha.
+        anisotropy: stretches highlights along a direction that is ``anisotropy_rotation`` (radians,
+            counter-clockwise) from the tangent; texture: direction in red and green, strength in
+            blue.
+        normal_texture, normal_scale: tangent-space normals, and the factor of their x and y.
+        emission: radiance (emissive factor times strength).
         double_sided: whether both sides *emit*; surfaces always reflect on both sides.
+        unlit: whether to show the base colour as it is, without light.
     """
 
     name: str = "default"
@@ -66,12 +88,46 @@ class Material:
     alpha_cutoff: float = 0.5
     metallic: float = 0.0
     roughness: float = 1.0
+    metallic_roughness_texture: int = -1
     specular: float = 1.0
+    specular_texture: int = -1
+    specular_color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    specular_color_texture: int = -1
     ior: float = 1.5
     transmission: float = 0.0
+    transmission_texture: int = -1
+    thin_walled: bool = False
+    attenuation_color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    attenuation_distance: float = float("inf")
+    clearcoat: float = 0.0
+    clearcoat_texture: int = -1
+    clearcoat_roughness: float = 0.0
+    clearcoat_roughness_texture: int = -1
+    sheen_color: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sheen_color_texture: int = -1
+    sheen_roughness: float = 0.0
+    sheen_roughness_texture: int = -1
+    anisotropy: float = 0.0
+    anisotropy_rotation: float = 0.0
+    anisotropy_texture: int = -1
+    normal_texture: int = -1
+    normal_scale: float = 1.0
     emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
     emission_texture: int = -1
     double_sided: bool = False
+    unlit: bool = False
+
+
+#: The parameters of a material that are textures.
+TEXTURE_FIELDS = tuple(item.name for item in fields(Material) if item.name.endswith("_texture"))
+
+#: Those whose picture is of colours, in sRGB; the others' are of numbers.
+COLOR_TEXTURES = (
+    "base_color_texture",
+    "emission_texture",
+    "specular_color_texture",
+    "sheen_color_texture",
+)
 
 
 @dataclass(frozen=True)
@@ -82,7 +138,10 @@ class Mesh:
         positions: ``(n, 3)`` float32.
         triangles: ``(m, 3)`` uint32, every index below ``n`` (readers check it).
         normals: ``(n, 3)`` float32 unit shading normals, or None for flat shading.
-        uvs: ``(n, 2)`` float32, or None.
+        uvs, uvs1: ``(n, 2)`` float32, or None.
+        colors: ``(n, 4)`` float32, linear RGB and alpha that multiply the base colour, or None.
+        tangents: ``(n, 4)`` float32: where u grows, and 1 or -1, the sign of the bitangent that is
+            normal x tangent; None to derive them from the normal map's coordinates.
     """
 
     name: str
@@ -90,6 +149,9 @@ class Mesh:
     triangles: np.ndarray
     normals: np.ndarray | None = None
     uvs: np.ndarray | None = None
+    uvs1: np.ndarray | None = None
+    colors: np.ndarray | None = None
+    tangents: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -202,20 +264,40 @@ def limited(radiance: Iterable[float]) -> tuple[float, float, float]:
 
 def emits(material: Material) -> bool:
     """Return whether ``material`` is a light."""
-    return max(material.emission) > 0.0
+    return max(material.emission) > 0.0 and not material.unlit
 
 
-def is_cut_out(material: Material) -> bool:
-    """Return whether hits on ``material`` must look up its alpha."""
-    return material.alpha_mode == "mask" and material.base_color_texture >= 0
+def is_cut_out(material: Material, mesh: Mesh | None = None) -> bool:
+    """Return whether hits on ``material``, on ``mesh`` if given, must look up their alpha."""
+    if material.alpha_mode == "opaque" or is_invisible(material):
+        return False
+    if material.base_color_texture >= 0:
+        return True
+    if mesh is not None and mesh.colors is not None and bool((mesh.colors[:, 3] < 1.0).any()):
+        return True
+    return material.alpha_mode == "blend" and material.alpha < 1.0
 
 
 def is_invisible(material: Material) -> bool:
     """Return whether ``material`` is cut out everywhere: its shapes are not there."""
+    least = {"mask": material.alpha_cutoff, "blend": 1e-6}.get(material.alpha_mode, 0.0)
+    return material.alpha < least
+
+
+def has_tangents(material: Material) -> bool:
+    """Return whether directions along the surface matter to ``material``."""
+    return material.normal_texture >= 0 or material.anisotropy > 0.0
+
+
+def has_layers(material: Material) -> bool:
+    """Return whether ``material`` has more than metal, glass and a plain coat over a base."""
     return (
-        material.alpha_mode == "mask"
-        and material.base_color_texture < 0
-        and material.alpha < material.alpha_cutoff
+        material.clearcoat > 0.0
+        or max(material.sheen_color) > 0.0
+        or material.anisotropy > 0.0
+        or material.specular_color != (1.0, 1.0, 1.0)
+        or material.specular_texture >= 0
+        or material.specular_color_texture >= 0
     )
 
 

@@ -22,7 +22,9 @@ from psf_cl.files import read_file
 from psf_cl.scene import transform
 from psf_cl.scene.environment import load_environment
 from psf_cl.scene.model import (
+    COLOR_TEXTURES,
     MAX_RADIANCE,
+    TEXTURE_FIELDS,
     Camera,
     Environment,
     Light,
@@ -97,17 +99,39 @@ ENVIRONMENT: Schema = {
 
 MATERIAL: Schema = {
     "base_color": Key(vector(3, 0, 1), "linear RGB"),
-    "base_color_texture": Key(text(), "an image file"),
-    "roughness": Key(_UNIT),
     "metallic": Key(_UNIT),
-    "specular": Key(_UNIT),
+    "roughness": Key(_UNIT),
     "ior": Key(number(1, 100)),
+    "specular": Key(_UNIT),
+    "specular_color": Key(vector(3, 0, 1), "linear RGB"),
     "transmission": Key(_UNIT),
+    "thin_walled": Key(flag(), "whether light goes through unbent"),
+    "attenuation_color": Key(vector(3, 0, 1), "linear RGB"),
+    "attenuation_distance": Key(number(above=0), "meters"),
+    "clearcoat": Key(_UNIT),
+    "clearcoat_roughness": Key(_UNIT),
+    "sheen_color": Key(vector(3, 0, 1), "linear RGB"),
+    "sheen_roughness": Key(_UNIT),
+    "anisotropy": Key(_UNIT),
+    "anisotropy_rotation": Key(number(-1e6, 1e6), "degrees"),
+    "normal_scale": Key(number(-1e6, 1e6)),
     "emission": Key(_RGB, "radiance, linear RGB"),
-    "emission_texture": Key(text(), "an image file"),
-    "alpha_mode": Key(text("opaque", "mask")),
+    "alpha": Key(_UNIT),
+    "alpha_mode": Key(text("opaque", "mask", "blend")),
     "alpha_cutoff": Key(_UNIT),
     "double_sided": Key(flag(), "whether both sides emit"),
+    "unlit": Key(flag(), "whether to show the base colour as it is"),
+    **{name: Key(either(text(), table()), "an image file, or a table") for name in TEXTURE_FIELDS},
+}
+
+TEXTURE: Schema = {
+    "file": Key(text(), "an image file", required=True),
+    "uv_set": Key(integer(0, 1)),
+    "offset": Key(vector(2, -1e6, 1e6)),
+    "rotation": Key(number(-1e6, 1e6), "degrees"),
+    "scale": Key(either(number(-1e6, 1e6), vector(2, -1e6, 1e6))),
+    "wrap": Key(text("repeat", "clamp", "mirror")),
+    "filter": Key(text("linear", "nearest")),
 }
 
 SHAPE: Schema = {
@@ -232,7 +256,8 @@ class _Assembly:
     own: dict[str, int] = field(default_factory=dict)
     files: dict[str, tuple[Scene, list[int]]] = field(default_factory=dict)
     read_files: list[str] = field(default_factory=list)
-    texture_indices: dict[str, int] = field(default_factory=dict)
+    images: dict[str, Texture] = field(default_factory=dict)
+    texture_indices: dict[tuple[Any, ...], int] = field(default_factory=dict)
     emitters: dict[tuple[int, Material], int] = field(default_factory=dict)
     primitives: dict[str, Mesh] = field(default_factory=dict)
 
@@ -291,7 +316,7 @@ class _Assembly:
             for material in scene.materials:
                 shifted = {
                     key: getattr(material, key) + offset
-                    for key in ("base_color_texture", "emission_texture")
+                    for key in TEXTURE_FIELDS
                     if getattr(material, key) >= 0
                 }
                 changes = self.overrides.get(material.name, {})
@@ -308,20 +333,46 @@ def _read_materials(raw: dict[str, Any], place: Place, assembly: _Assembly) -> N
     for name, values in raw.items():
         here = place.key(name)
         changes = read_table(values, MATERIAL, here)
-        for key in ("base_color_texture", "emission_texture"):
+        for key in TEXTURE_FIELDS:
             if key in changes:
-                changes[key] = _texture(changes[key], here.key(key), assembly)
+                changes[key] = _texture(
+                    changes[key], here.key(key), assembly, key in COLOR_TEXTURES
+                )
+        if "anisotropy_rotation" in changes:
+            changes["anisotropy_rotation"] = math.radians(changes["anisotropy_rotation"])
         assembly.overrides[name] = changes
 
 
-def _texture(name: str, place: Place, assembly: _Assembly) -> int:
-    path = assembly.file(name, place)
-    key = os.path.realpath(path)
-    if key not in assembly.texture_indices:
+def _texture(value: str | dict[str, Any], place: Place, assembly: _Assembly, srgb: bool) -> int:
+    """Return the index of the texture that ``value``, a file name or a table, describes."""
+    values: dict[str, Any] = {"file": value}
+    named = place
+    if isinstance(value, dict):
+        values = read_table(value, TEXTURE, place)
+        named = place.key("file")
+    path = assembly.file(values["file"], named)
+    image = os.path.realpath(path)
+    if image not in assembly.images:
         try:
-            texture = load_texture(path)
+            assembly.images[image] = load_texture(path)
         except InputError as error:
-            raise place.error(str(error)) from None
+            raise named.error(str(error)) from None
+    across, down = np.broadcast_to(values.get("scale", 1.0), 2).tolist()
+    wrap = values.get("wrap", "repeat")
+    texture = replace(
+        assembly.images[image],
+        srgb=srgb,
+        wrap=(wrap, wrap),
+        filter=values.get("filter", "linear"),
+        uv_set=values.get("uv_set", 0),
+        transform=transform.uv_rows(
+            values.get("offset", (0.0, 0.0)),
+            math.radians(values.get("rotation", 0.0)),
+            (across, down),
+        ),
+    )
+    key = (image, srgb, texture.wrap, texture.filter, texture.uv_set, texture.transform)
+    if key not in assembly.texture_indices:
         assembly.texture_indices[key] = len(assembly.textures)
         assembly.textures.append(texture)
     return assembly.texture_indices[key]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -106,3 +107,20 @@ def _unit(vector: np.ndarray, name: str) -> np.ndarray:
         raise ValueError(f"{name} must be finite and not zero")
     scaled = vector / largest
     return scaled / np.linalg.norm(scaled)
+
+
+def uv_rows(
+    offset: Sequence[float], rotation: float, scale: Sequence[float]
+) -> tuple[float, float, float, float, float, float]:
+    """Return the first two rows of the matrix that scales, rotates and then moves coordinates.
+
+    Args:
+        rotation: radians, counter-clockwise as one sees a picture whose v grows downwards.
+
+    Source: KHR_texture_transform.
+    """
+    cosine, sine = math.cos(rotation), math.sin(rotation)
+    return (
+        *(cosine * scale[0], sine * scale[1], offset[0]),
+        *(-sine * scale[0], cosine * scale[1], offset[1]),
+    )

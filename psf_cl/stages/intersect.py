@@ -18,7 +18,7 @@ def plan(context: Context) -> StageSpec:
         "intersect",
         "every ray needs its closest hit",
         "intersect.cl",
-        flags=("FEW", "ALPHA", "CELLS"),
+        flags=("FEW", "ALPHA", "VERTEX_COLORS", "CELLS"),
         kernels=(kernel,),
         traces=True,
     )

@@ -30,6 +30,9 @@ def plan(context: Context) -> StageSpec:
             "SMOOTH",
             "GLOSSY",
             "TRANSMISSION",
+            "VERTEX_COLORS",
+            "TANGENTS",
+            "LAYERS",
             "AREA_LIGHTS",
             "PUNCTUAL_LIGHTS",
             "ENVIRONMENT",
@@ -59,6 +62,10 @@ def _kernel(context: Context) -> KernelSpec:
         records.append(layout.NORMALS)
     if context.on("TEXTURES"):
         records += [layout.UVS, layout.TEXTURE]
+    if context.on("VERTEX_COLORS"):
+        records.append(layout.VERTEX_COLORS)
+    if context.on("TANGENTS"):
+        records.append(layout.TANGENTS)
     if context.on("CONNECT"):
         records.append(layout.LIGHT)
         if context.on("AREA_LIGHTS"):

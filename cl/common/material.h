@@ -1,0 +1,159 @@
+// A point's material: the record and its textures become the parameters of the BSDF and of emission.
+#pragma once
+
+#include "lanes.h"
+#include "layout.h"
+#include "alpha.h"
+#include "bsdf.h"
+#include "surface.h"
+#include "texture.h"
+
+#define GATHER_COLOR(array, index, member)                                                         \
+    vec3(GATHER(array, index, member[0]), GATHER(array, index, member[1]), GATHER(array, index, member[2]))
+
+// The texture `member` of material `m` at a point of a triangle; `alpha` gets its fourth channel.
+#define LOOK_UP(mask, m, member, alpha)                                                            \
+    look_up_lanes(mask, GATHER_U(materials, m, member), s.triangle, u, v TEXTURE_ARGUMENTS, alpha)
+
+#if AREA_LIGHTS
+/// Radiance that the lanes of `mask` give away, on either side.
+inline Vec3 fetch_emission(
+    Mask mask, SurfacePoint s, Float u, Float v, __global const Material *materials TEXTURE_PARAMETERS COLOR_PARAMETERS)
+{
+    Vec3 emission = GATHER_COLOR(materials, s.material, emission);
+#if TEXTURES
+    emission = textured(mask, emission, GATHER_U(materials, s.material, emission_texture), s.triangle, u,
+                        v TEXTURE_ARGUMENTS);
+#endif
+#if VERTEX_COLORS
+    const Mask unlit = mask & ((GATHER_U(materials, s.material, flags) & MATERIAL_UNLIT) != 0u);
+    if (any_lane(unlit))
+        emission = pick_v(unlit, mul(emission, corner_color(s.triangle, u, v, colors)), emission);
+#endif
+    return emission;
+}
+#endif
+
+#if TANGENTS
+/// `ns` turned so far that the mirrored direction of `wo` does not go below the real surface.
+///
+/// Otherwise steep parts of a normal map would be black.
+inline Vec3 with_visible_mirror(Vec3 ns, Vec3 ng, Vec3 wo)
+{
+    const Vec3 mirrored = add_scaled(scale(wo, (Float)(-1.0f)), ns, 2.0f * dot3(ns, wo));
+    const Float least = min(0.9f * dot3(ng, wo), (Float)(0.01f));
+    const Float lacks = least - dot3(ng, mirrored);
+    const Vec3 lifted = normalize3(add_scaled(mirrored, ng, lacks));
+    return pick_v(lacks > 0.0f, normalize3(add(lifted, wo)), ns);
+}
+
+/// Give `s` its mapped normal, and the frame of the shading normal the direction of the tangent.
+///
+/// What is seen from behind is mapped as from the front and then turned: a bump is a dent there.
+/// Returns the strength of the anisotropy along that direction.
+LARGE_FUNCTION Float map_normal(
+    Mask mask,
+    SurfacePoint *point,
+    Float u,
+    Float v,
+    Vec3 wo,
+    __global const Material *materials,
+    __global const Tangents *tangents TEXTURE_PARAMETERS,
+    Vec3 *tangent,
+    Vec3 *bitangent)
+{
+    const SurfacePoint s = *point;
+    const Float side = pick(s.front, (Float)(1.0f), (Float)(-1.0f));
+    const Vec3 n = scale(s.ns, side);
+    const Float w = 1.0f - u - v;
+    const Vec3 t0 = GATHER_COLOR(tangents, s.triangle, t0);
+    const Vec3 t1 = GATHER_COLOR(tangents, s.triangle, t1);
+    const Vec3 t2 = GATHER_COLOR(tangents, s.triangle, t2);
+    Vec3 t = add_scaled(add_scaled(scale(t0, w), t1, u), t2, v);
+    t = add_scaled(t, n, -dot3(t, n));
+    Vec3 b;
+    Vec3 any_t;
+    make_frame(n, &any_t, &b);
+    t = normalize3(pick_v(dot3(t, t) > 1e-12f, t, any_t));
+    b = scale(cross3(n, t), pick(GATHER(tangents, s.triangle, t0[3]) < 0.0f, (Float)(-1.0f), (Float)(1.0f)));
+
+    Vec3 mapped = n;
+    Float anisotropy = (Float)(0.0f);
+#if TEXTURES
+    Float alpha;
+    const Mask bumpy = mask & (GATHER_U(materials, s.material, normal_texture) != NO_TEXTURE);
+    if (any_lane(bumpy)) {
+        const Vec3 c = LOOK_UP(bumpy, s.material, normal_texture, &alpha);
+        const Float strength = GATHER(materials, s.material, normal_scale);
+        const Vec3 m = add_scaled(add_scaled(scale(t, strength * (2.0f * c.x - 1.0f)), b,
+                                             strength * (2.0f * c.y - 1.0f)),
+                                  n, 2.0f * c.z - 1.0f);
+        mapped = pick_v(bumpy & (dot3(m, m) > 1e-12f), normalize3(m), mapped);
+        const Vec3 ns = with_visible_mirror(scale(mapped, side), s.ng, wo);
+        point->ns = pick_v(bumpy, ns, s.ns);
+        mapped = scale(point->ns, side);
+    }
+#endif
+#if LAYERS
+    anisotropy = GATHER(materials, s.material, anisotropy);
+    Float x = GATHER(materials, s.material, anisotropy_direction[0]);
+    Float y = GATHER(materials, s.material, anisotropy_direction[1]);
+#if TEXTURES
+    const Mask turned = mask & (GATHER_U(materials, s.material, anisotropy_texture) != NO_TEXTURE);
+    if (any_lane(turned)) {
+        const Vec3 c = LOOK_UP(turned, s.material, anisotropy_texture, &alpha);
+        const Float cx = 2.0f * c.x - 1.0f;
+        const Float cy = 2.0f * c.y - 1.0f;
+        const Float old_x = x;
+        x = pick(turned, old_x * cx - y * cy, old_x);
+        y = pick(turned, old_x * cy + y * cx, y);
+        anisotropy = pick(turned, anisotropy * c.z, anisotropy);
+    }
+#endif
+    t = add_scaled(scale(t, x), b, y);
+#endif
+    t = add_scaled(t, mapped, -dot3(t, mapped));
+    make_frame(point->ns, &any_t, &b);
+    t = normalize3(pick_v(dot3(t, t) > 1e-12f, t, any_t));
+    *tangent = t;
+    *bitangent = cross3(point->ns, t);
+    return anisotropy;
+}
+#endif
+
+/// Parameters of the BSDF in the lanes of `mask`.
+LARGE_FUNCTION Bsdf fetch_bsdf(
+    Mask mask, SurfacePoint s, Float u, Float v, __global const Material *materials TEXTURE_PARAMETERS COLOR_PARAMETERS)
+{
+    Bsdf b;
+    b.base_color = GATHER_COLOR(materials, s.material, base_color);
+#if TEXTURES
+    b.base_color = textured(mask, b.base_color, GATHER_U(materials, s.material, base_color_texture), s.triangle,
+                            u, v TEXTURE_ARGUMENTS);
+#endif
+#if VERTEX_COLORS
+    b.base_color = mul(b.base_color, corner_color(s.triangle, u, v, colors));
+#endif
+#if GLOSSY
+    b.metallic = GATHER(materials, s.material, metallic);
+    Float roughness = GATHER(materials, s.material, roughness);
+#if TEXTURES
+    Float alpha;
+    const Vec3 metal = LOOK_UP(mask, s.material, metallic_roughness_texture, &alpha);
+    roughness *= metal.y;
+    b.metallic *= metal.z;
+#endif
+    b.alpha = max(roughness * roughness, ALPHA_GGX_MIN);
+    b.specular = GATHER(materials, s.material, specular);
+    b.f0 = GATHER(materials, s.material, f0) * b.specular;
+#endif
+#if TRANSMISSION
+    b.transmission = GATHER(materials, s.material, transmission);
+#if TEXTURES
+    b.transmission *= LOOK_UP(mask, s.material, transmission_texture, &alpha).x;
+#endif
+    const Float ior = GATHER(materials, s.material, ior);
+    b.eta = pick(s.front, ior, 1.0f / ior);
+#endif
+    return b;
+}
