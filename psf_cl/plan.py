@@ -254,7 +254,11 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
     cut_out = any(is_cut_out(scene.materials[shape.material], shape.mesh) for shape in shapes)
     blended = cut_out and any(m.alpha_mode == "blend" for m in materials)
     glows = any(emits(m) or m.unlit for m in materials)
-    glossy = any(m.metallic > 0.0 or m.specular > 0.0 or m.transmission > 0.0 for m in materials)
+    glossy = any(
+        (m.metallic > 0.0 or m.specular > 0.0 or m.transmission > 0.0 or has_layers(m))
+        and not m.unlit
+        for m in materials
+    )
     feature_aovs = outputs & {"albedo", "normal", "depth"}
     return {
         "TEXTURES": switch(
@@ -284,11 +288,6 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "no mesh has shading normals",
         ),
         "GLOSSY": switch(
-            any(
-                (m.metallic > 0.0 or m.specular > 0.0 or m.transmission > 0.0 or has_layers(m))
-                and not m.unlit
-                for m in materials
-            ),
             glossy,
             "a material has a coat or is a metal",
             "every material is matt",
