@@ -226,7 +226,7 @@ BAD_OPTIONS = {
     "--set termination=1": "termination",
     "--set integrator=mlt": "integrator",
     "--set roulette_depth=x": "roulette_depth",
-    "--preset psf": "preset",
+    "--preset fast": "preset",
     "--camera nobody": "no camera 'nobody'",
     "--exposure nan": "--exposure",
     "--environment no.exr": "no.exr: expected a file, got nothing",
