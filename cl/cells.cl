@@ -103,15 +103,11 @@ kernel void store_cells(
         const CellKey key = cell_of(params, s.query, a, b);
         const Vec3 light = demodulated(s.beyond, s.gate);
         const Float value[3] = {light.x, light.y, light.z};
-        uint low[3][W];
-        uint high[3][W];
+        UInt low[3];
+        UInt high[3];
         UInt random = mix_bits(a + rotate(b, (UInt)(11u)));
         for (uint c = 0; c < 3; ++c) {
-            UInt low_word;
-            UInt high_word;
-            to_fixed(value[c], (Float)(params->cell_steps), unit_float(random), &low_word, &high_word);
-            store_lanes_u(low_word, low[c]);
-            store_lanes_u(high_word, high[c]);
+            to_fixed(value[c], (Float)(params->cell_steps), unit_float(random), &low[c], &high[c]);
             random = mix_bits(random + 0x9e3779b9u);
         }
         uint lane_bucket[W];
@@ -123,21 +119,20 @@ kernel void store_cells(
         const uint table = pass & (params->ring - 1u);
         volatile __global uint *keys = cell_keys + (ulong)table * slots;
         volatile __global Cell *sums = cells + (ulong)table * slots;
-        uint failed = 0;
+        uint lane_slot[W];
+        store_lanes_u((UInt)(NO_SLOT), lane_slot);
         for (uint left = lane_bits(s.there); left; left &= left - 1u) {
             const uint i = lowest_bit(left);
-            const uint slot = find_or_insert(keys, lane_bucket[i], size, lane_key[i]);
-            if (slot == NO_SLOT) {
+            lane_slot[i] = find_or_insert(keys, lane_bucket[i], size, lane_key[i]);
+            if (lane_slot[i] == NO_SLOT)
                 full_buckets[(ulong)table * (slots / size) + lane_bucket[i] / size] = 1u;
-                ++failed;
-                continue;
-            }
-            const uint sample_low[3] = {low[0][i], low[1][i], low[2][i]};
-            const uint sample_high[3] = {high[0][i], high[1][i], high[2][i]};
-            add_to_cell(&sums[slot], sample_low, sample_high, 1u);
         }
+        const UInt slot = load_lanes_u(lane_slot);
+        const Mask stored = slot != NO_SLOT;
+        const uint failed = count_lanes(s.there & !stored);
         if (failed != 0u)
             atomic_add(&counters[COUNTER_FAILED_INSERTS], failed);
+        add_lanes(sums, stored, slot, low, high);
     }
 }
 

@@ -50,7 +50,8 @@ inline Float cell_edge(UInt level) { return from_bits(level << 23); }
 /// Return the cell of a point that is moved in its tangent plane by up to half a cell.
 ///
 /// The level is chosen again after the move, or there would be cells of levels that no point that
-/// stays has.  Walls lie on planes of round numbers: the grid is shifted off these.
+/// stays has.  Walls lie on planes of round numbers: the grid is shifted off these.  Blocks of 2 x 2 x 2
+/// cells share a bucket, for neighbours are looked up together.
 inline CellKey cell_of(__global const Params *params, CellQuery q, UInt random_x, UInt random_y)
 {
     const Float dither = unit_float(mix_bits(random_x ^ rotate(random_y, (UInt)(16u))));
@@ -70,10 +71,14 @@ inline CellKey cell_of(__global const Params *params, CellQuery q, UInt random_x
         level = cell_level(pick(q.seen, q.width * ratio, q.width), dither);
     }
     const Float inverse = 1.0f / cell_edge(level);
+    const Vec3 cell = vec3(floor(p.x * inverse + 0.37f), floor(p.y * inverse + 0.61f), floor(p.z * inverse + 0.83f));
+    const Vec3 block = vec3(floor(cell.x * 0.5f), floor(cell.y * 0.5f), floor(cell.z * 0.5f));
+    const UInt corner = to_uint(cell.x - 2.0f * block.x) + 2u * to_uint(cell.y - 2.0f * block.y)
+                        + 4u * to_uint(cell.z - 2.0f * block.z);
     // A zero of its own sign would be another number: 0 is added.
-    const UInt x = as_bits(floor(p.x * inverse + 0.37f) + 0.0f);
-    const UInt y = as_bits(floor(p.y * inverse + 0.61f) + 0.0f);
-    const UInt z = as_bits(floor(p.z * inverse + 0.83f) + 0.0f);
+    const UInt x = as_bits(block.x + 0.0f);
+    const UInt y = as_bits(block.y + 0.0f);
+    const UInt z = as_bits(block.z + 0.0f);
 
     UInt index = mix_bits(level + q.extra * 0x9e3779b9u);
     index = mix_bits(index + x);
@@ -85,7 +90,8 @@ inline CellKey cell_of(__global const Params *params, CellQuery q, UInt random_x
     print = mix_bits_too(print ^ z);
     CellKey key;
     key.bucket = bucket_of(index, params->cell_slots);
-    key.key = fingerprint(print);
+    // Probing starts at the slot that the last bits name: those of a block are side by side.
+    key.key = fingerprint((print & ~63u) | ((index >> 23) & 56u) | corner);
     return key;
 }
 

@@ -90,10 +90,35 @@ inline void add_fixed(volatile __global uint *low, volatile __global uint *high,
         atomic_add(high, carry);
 }
 
-/// Add `count` samples, whose radiance sums up to the fixed-point numbers given, to a cell.
-inline void add_to_cell(volatile __global Cell *cell, const uint *low, const uint *high, uint count)
+/// Add samples, `count` of them, whose radiance sums up to the fixed-point numbers given, to a cell.
+inline void add_to_cell(volatile __global Cell *cell, const ulong *sum, uint count)
 {
     for (uint c = 0; c < 3; ++c)
-        add_fixed(&cell->low[c], &cell->high[c], low[c], high[c]);
+        add_fixed(&cell->low[c], &cell->high[c], (uint)sum[c], (uint)(sum[c] >> 32));
     atomic_add(&cell->count, count);
+}
+
+/// Add the samples of the lanes in `mask` to the cells at `slot`: one addition for all of a cell.
+inline void add_lanes(volatile __global Cell *cells, Mask mask, UInt slot, const UInt *low, const UInt *high)
+{
+    uint lane_slot[W];
+    uint lane_low[3][W];
+    uint lane_high[3][W];
+    store_lanes_u(slot, lane_slot);
+    for (uint c = 0; c < 3; ++c) {
+        store_lanes_u(low[c], lane_low[c]);
+        store_lanes_u(high[c], lane_high[c]);
+    }
+    for (uint left = lane_bits(mask); left;) {
+        const uint at = lane_slot[lowest_bit(left)];
+        const uint same = left & lane_bits(slot == at);
+        left &= ~same;
+        ulong sum[3] = {0, 0, 0};
+        for (uint more = same; more; more &= more - 1u) {
+            const uint k = lowest_bit(more);
+            for (uint c = 0; c < 3; ++c)
+                sum[c] += lane_low[c][k] + ((ulong)lane_high[c][k] << 32);
+        }
+        add_to_cell(&cells[at], sum, popcount(same));
+    }
 }

@@ -19,25 +19,16 @@ kernel void insert_samples(
     uint lane_key[W];
     store_lanes_u(bucket_of(mix_bits(number), slots), lane_bucket);
     store_lanes_u(fingerprint(mix_bits_too(number)), lane_key);
-    uint low[3][W];
-    uint high[3][W];
-    for (uint c = 0; c < 3; ++c) {
-        UInt low_word;
-        UInt high_word;
-        to_fixed(LOAD(value, c), (Float)(steps), LOAD(u, c), &low_word, &high_word);
-        store_lanes_u(low_word, low[c]);
-        store_lanes_u(high_word, high[c]);
-    }
+    UInt low[3];
+    UInt high[3];
+    for (uint c = 0; c < 3; ++c)
+        to_fixed(LOAD(value, c), (Float)(steps), LOAD(u, c), &low[c], &high[c]);
     uint lane_slot[W];
-    for (uint k = 0; k < W; ++k) {
+    for (uint k = 0; k < W; ++k)
         lane_slot[k] = find_or_insert(keys, lane_bucket[k], bucket_size(slots), lane_key[k]);
-        if (lane_slot[k] == NO_SLOT)
-            continue;
-        const uint sample_low[3] = {low[0][k], low[1][k], low[2][k]};
-        const uint sample_high[3] = {high[0][k], high[1][k], high[2][k]};
-        add_to_cell(&cells[lane_slot[k]], sample_low, sample_high, 1u);
-    }
-    STORE_U(slot, 0, load_lanes_u(lane_slot));
+    const UInt place = load_lanes_u(lane_slot);
+    add_lanes(cells, place != NO_SLOT, place, low, high);
+    STORE_U(slot, 0, place);
 }
 
 kernel void find_keys(global const uint *key, global const uint *keys, global uint *slot, const uint slots)
