@@ -138,6 +138,9 @@ kernel void shade_paths(
                                    , normals
 #endif
     );
+#if TRANSMISSION
+    beta = mul(beta, attenuation(hit, s, FIELD(path, PATH_HIT_T), materials));
+#endif
 
 #if AREA_LIGHTS
     const UInt flags = GATHER_U(materials, s.material, flags);
@@ -183,9 +186,12 @@ kernel void shade_paths(
 #if TANGENTS
     Vec3 tangent;
     Vec3 bitangent;
-    map_normal(hit, &s, u, v, wo, materials, tangents TEXTURE_ARGUMENTS, &tangent, &bitangent);
+    const Float anisotropy =
+        map_normal(hit, &s, u, v, wo, materials, tangents TEXTURE_ARGUMENTS, &tangent, &bitangent);
+#else
+    const Float anisotropy = (Float)(0.0f);
 #endif
-    const Bsdf b = fetch_bsdf(hit, s, u, v, materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS);
+    const Bsdf b = fetch_bsdf(hit, s, u, v, anisotropy, materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS);
 
     const UInt sample = get_u(path, PATH_SAMPLE);
     const UInt pixel = get_u(path, PATH_PIXEL);
@@ -214,7 +220,7 @@ kernel void shade_paths(
 #if CELLS
     // Light is divided by the reflectance of the base before it is shared: textures stay sharp.
 #if CELLS == 2
-    const Float base = base_gate(b, wo_local.z);
+    const Float base = base_gate(b, chances, wo_local.z);
     const Vec3 gate = mul(beta, scale(b.base_color, base));
 #else
     const Vec3 gate = mul(beta, b.base_color);
@@ -260,7 +266,7 @@ kernel void shade_paths(
             mul(mul(beta, f), scale(light.radiance, weight / pick(lit, light.pdf, (Float)(1.0f))));
         put_v(path, PATH_LIGHT_R, pick_v(lit, arrives, zero));
 #if CELLS == 2
-        put_v(path, PATH_LIGHT_SHARE_R, pick_v(chosen, base_share(b, base, wi_local, f), share));
+        put_v(path, PATH_LIGHT_SHARE_R, pick_v(chosen, base_share(b, chances, base, wi_local, f), share));
 #endif
         // On the far side (glass) the ray starts below; the light stays where it is.
         const Vec3 origin = ray_origin(s, light.wi);
@@ -278,7 +284,7 @@ kernel void shade_paths(
     Float pdf;
     const Vec3 f = eval_bsdf(b, chances, wo_local, drawn, dot3(s.ng, wi), &pdf);
 #if CELLS == 2
-    share = pick_v(chosen, base_share(b, base, drawn, f), share);
+    share = pick_v(chosen, base_share(b, chances, base, drawn, f), share);
     put_v(path, PATH_SHARE_R, share);
 #endif
     beta = mul(beta, scale(f, 1.0f / pick(pdf > 0.0f, pdf, (Float)(1.0f))));

@@ -45,6 +45,8 @@ class Bsdf:
             self.specular,
             self.transmission,
             self.eta,
+            # Not thin, white tint, no clear coat, no sheen, isotropic.
+            *(0.0, 1.0, 1.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, self.alpha),
         ]
 
 
@@ -105,7 +107,9 @@ def eval_reflection(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
     h = unit(wo + wi)
     cosine = dot(wo, h)
     base = np.array(b.base_color)
-    metal = schlick(base, 1.0, cosine[..., None])
+    metal = schlick(base, 1.0, cosine[..., None]) * (
+        1 + base * metal_gain(b, wo[..., 2])[..., None]
+    )
     f = (1 - b.metallic) * dielectric(b, cosine)[..., None] + b.metallic * metal
     with np.errstate(all="ignore"):
         g = masking_shadowing(wo, wi, b.alpha)
@@ -113,19 +117,59 @@ def eval_reflection(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
     return np.where(wi[..., 2:] > 0, f * value[..., None], 0)
 
 
+# The renderer's fits, rows by the power of s; tests hold them against quadrature.
+MIRROR_FIT = [
+    (0.026616, -0.0581, -0.009742, 0.060876),
+    (-0.348857, 1.888125, 3.694314, -2.159958),
+    (2.78666, -9.259536, -7.005814, 8.277222),
+    (-2.504882, 12.704153, 27.23154, -26.873594),
+    (-0.09363, -6.105178, -15.355658, 18.573616),
+]
+EDGE_FIT = [
+    (-0.027605, 0.549456, 0.104114, 0.389766),
+    (0.000757, 1.614906, -1.508364, -0.885409),
+    (-2.518936, 7.571762, -12.173236, 8.51786),
+    (4.750035, -12.610544, 16.317993, -9.09099),
+]
+
+
+def polynomial(x, coefficients):
+    return sum(c * x**k for k, c in enumerate(coefficients))
+
+
+def mirror_albedo(alpha: float, cosine: np.ndarray) -> np.ndarray:
+    """Albedo of a white GGX mirror, rather too large."""
+    s = cosine / (cosine + alpha)
+    fit = sum(s**k * polynomial(alpha, row) for k, row in enumerate(MIRROR_FIT))
+    safe = 0.0047 + 0.014 * np.maximum(1 - 50 * cosine, 0)
+    return np.clip(1 - (1 - s) * fit + safe, 0.25, 1)
+
+
+def edge_albedo(alpha: float, cosine: np.ndarray) -> np.ndarray:
+    """Albedo of GGX with a reflectance of (1 - cos)^5, rather too large."""
+    s = cosine / (cosine + alpha)
+    fit = sum(s**k * polynomial(1 / (1 + 8 * alpha), row) for k, row in enumerate(EDGE_FIT))
+    safe = 0.006 * (1 - cosine**4) + 0.014 * np.maximum(1 - 50 * cosine, 0)
+    return (1 - cosine) ** 5 * fit + safe
+
+
 def coat_albedo(b: Bsdf, cosine: np.ndarray) -> np.ndarray:
-    """The renderer's fit; a test holds it against quadrature."""
-    x = 1 - cosine
-    mirror = 1 - 0.6 * b.alpha * (1 - 0.9 * x**3)
-    edge = x**5 / (1 + 8 * b.alpha**2 + 10 * b.alpha * x**10)
-    return b.f0 * mirror + (b.specular - b.f0) * edge
+    mirror, edge = mirror_albedo(b.alpha, cosine), edge_albedo(b.alpha, cosine)
+    return np.minimum(b.f0 * mirror + (b.specular - b.f0) * edge, 1.0)
+
+
+def metal_gain(b: Bsdf, cosine: np.ndarray) -> np.ndarray:
+    """Turquin: Practical Multiple Scattering Compensation, 2019."""
+    kept = mirror_albedo(b.alpha, cosine)
+    return (1 - kept) / kept
 
 
 def average_coat_albedo(b: Bsdf) -> float:
     """The renderer's fit; a test holds it against the mean of coat_albedo."""
-    mirror = 1 - 0.546 * b.alpha
-    edge = 1 / (21 + 27 * b.alpha + 165 * b.alpha**2)
-    return b.f0 * mirror + (b.specular - b.f0) * edge
+    r, q = b.alpha**0.5, 1 / (1 + 8 * b.alpha)
+    mirror = polynomial(r, (1.006173, -0.043687, 0.676312, -3.377032, 2.783756, -0.631296))
+    edge = polynomial(q, (0.005262, -0.049972, 0.563542, -1.113004, 0.986581, -0.340664))
+    return b.f0 * min(mirror, 1.0) + (b.specular - b.f0) * edge
 
 
 def eval_diffuse(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:

@@ -11,8 +11,12 @@ from bsdf_truth import Bsdf, Lobe
 from scipy import stats
 
 P_MIN = 1e-4
-BY_CHANCE = (-1.0, -1.0, -1.0)
-ONLY = {"reflect": (1.0, 0.0, 0.0), "refract": (0.0, 1.0, 0.0), "diffuse": (0.0, 0.0, 1.0)}
+BY_CHANCE = (-1.0, -1.0, -1.0, -1.0)
+ONLY = {
+    "reflect": (1.0, 0.0, 0.0, 0.0),
+    "refract": (0.0, 1.0, 0.0, 0.0),
+    "diffuse": (0.0, 0.0, 1.0, 0.0),
+}
 
 MATERIALS = {
     "lambert": Bsdf(specular=0.0, roughness=1.0),
@@ -38,7 +42,7 @@ def direction(cosine, phi=0.4):
 
 def run(device, kernel, inputs, outputs, transmission=1, glossy=1):
     inputs = {name: np.ascontiguousarray(v, np.float32) for name, v in inputs.items()}
-    defines = {"GLOSSY": glossy, "TRANSMISSION": transmission}
+    defines = {"GLOSSY": glossy, "TRANSMISSION": transmission, "LAYERS": transmission}
     return planes.run(device, "bsdf_test.cl", kernel, inputs, outputs, defines)
 
 
@@ -70,7 +74,7 @@ def evaluate(device, records, given, wo, wi, side=None, build=()):
 def chances(device, records, wo, *build):
     """Return the chances to reflect, refract and scatter, ``(n, 3)``."""
     inputs = {"materials": records.T, "wo": wo.T}
-    return run(device, "list_chances", inputs, {"chances": (np.float32, 3)}, *build)[0].T
+    return run(device, "list_chances", inputs, {"chances": (np.float32, 4)}, *build)[0].T[:, :3]
 
 
 def left_of_choice(device, records, wo, numbers, *build):
@@ -129,7 +133,7 @@ def test_values_and_densities_equal_the_papers(lane_device, opaque):
     if opaque:
         bsdfs = [truth.replace(b, transmission=0.0) for b in bsdfs]
     records = np.array([b.record() for b in bsdfs])
-    by_chance = np.full((count, 3), -1.0)
+    by_chance = np.full((count, 4), -1.0)
     build = 0 if opaque else 1
     # Half of the pairs at random, half where the BSDF has its peaks.
     numbers = np.random.default_rng(2).random((count, 3))
@@ -271,11 +275,13 @@ def test_share_of_refracted_samples_is_the_chance_to_refract(lane_device):
     np.testing.assert_allclose(below, chance, rtol=0, atol=5 * 0.5 / np.sqrt(count))
 
 
-def test_reflection_is_reciprocal(lane_device):
+def test_reflection_of_dielectrics_is_reciprocal(lane_device):
+    """That of metals is not: what scatters between facets is reckoned from one side."""
     bsdfs, wo, wi = random_pairs(3000, 9)
+    bsdfs = [truth.replace(b, metallic=0.0) for b in bsdfs]
     wi[:, 2] = abs(wi[:, 2])
     records = np.array([b.record() for b in bsdfs])
-    given = np.full((len(bsdfs), 3), -1.0)
+    given = np.full((len(bsdfs), 4), -1.0)
     there, _ = evaluate(lane_device, records, given, wo, wi)
     back, _ = evaluate(lane_device, records, given, wi, wo)
     f, g = there / wi[:, 2:], back / wo[:, 2:]
@@ -323,8 +329,8 @@ def test_nothing_reflects_more_than_it_receives(lane_device):
     weight = weight.astype(np.float64).reshape(count, len(cases))
     deviation = weight.std(axis=0) / np.sqrt(count)
     over = weight.mean(axis=0) - 1 - 4 * deviation
-    # What enters under a coat is reckoned with a fit.
-    assert over.max() < 0.012, cases[int(over.argmax())]
+    # What enters under a coat is reckoned with fits.
+    assert over.max() < 0.001, cases[int(over.argmax())]
 
 
 @pytest.mark.parametrize("ior", [1.3, 1.5, 2.4])
@@ -332,13 +338,13 @@ def test_nothing_reflects_more_than_it_receives(lane_device):
 def test_albedo_of_a_coat_is_what_it_reflects(roughness, ior):
     """So a white base under it gives back nearly all: 1 + reflected - fit."""
     coat = Bsdf(base_color=(0.0, 0.0, 0.0), roughness=roughness, ior=ior)
-    for cosine, too_large in ((1.0, 0.02), (0.5, 0.04), (0.15, 0.13), (0.05, 0.13)):
+    for cosine in (1.0, 0.5, 0.15, 0.05, 0.02):
         reflected = truth.albedo(coat, direction(cosine))[0]
         over = truth.coat_albedo(coat, cosine) - reflected
-        assert -0.012 < over < too_large, cosine
+        assert -0.001 < over < 0.0125, cosine
     cosines = np.sqrt((np.arange(20000) + 0.5) / 20000)
     average = truth.coat_albedo(coat, cosines).mean()
-    assert abs(truth.average_coat_albedo(coat) - average) < 3e-4
+    assert abs(truth.average_coat_albedo(coat) - average) < 5e-4
 
 
 def test_what_is_left_of_the_choice_of_a_lobe_is_uniform(lane_device):
@@ -406,7 +412,7 @@ def test_weights_stay_finite_at_the_extremes(lane_device):
     cosines = (1.0, 0.3, 1e-3, 1e-6)
     cases = [(b, BY_CHANCE, direction(c)) for b in bsdfs for c in cosines]
     records = np.repeat([b.record() for b, _, _ in cases], len(numbers), axis=0)
-    given = np.full((len(records), 3), -1.0)
+    given = np.full((len(records), 4), -1.0)
     wo = np.repeat([o for _, _, o in cases], len(numbers), axis=0)
     u = np.tile(numbers, (len(cases), 1))
     wi, values, pdfs = sample(lane_device, records, given, wo, u)
@@ -421,6 +427,6 @@ def test_weights_stay_finite_at_the_extremes(lane_device):
 def test_nothing_crosses_the_real_surface_by_a_shading_normal(lane_device):
     bsdfs, wo, wi = random_pairs(2000, 13)
     records = np.array([b.record() for b in bsdfs])
-    given = np.full((len(bsdfs), 3), -1.0)
+    given = np.full((len(bsdfs), 4), -1.0)
     values, pdfs = evaluate(lane_device, records, given, wo, wi, side=-wi[:, 2])
     assert not values.any() and not pdfs.any()

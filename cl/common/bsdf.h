@@ -10,8 +10,16 @@
 // that it gets and never more (glTF's 1 - F(o.h) gains up to four fifths at grazing angles).  Kelemen,
 // Szirmay-Kalos: A Microfacet Based Coupled Specular-Matte BRDF Model, 2001.
 // GGX: Walter et al. 2007; height-correlated masking: Heitz 2014; sampled by its bounded visible
-// normals: Dupuy and Benyoub 2023, Eto and Tokuyoshi 2023.  Single scattering: rough metals lose
-// energy (up to half at roughness 1).
+// normals: Dupuy and Benyoub 2023, Eto and Tokuyoshi 2023.
+//
+// Scattering between facets: a metal's lobe is raised by 1 + F0 (1 - R(cos o)) / R(cos o), R the albedo
+// of a white one (Turquin: Practical Multiple Scattering Compensation for Microfacet Models, 2019), and
+// both lobes of a sheet of glass by 1 / R.  That gives up reciprocity, for no further lobe has to be
+// drawn.  What a bent ray loses in rough glass stays lost.
+//
+// LAYERS: f = sheen + (1 - S(cos o)) (coat + (1 - C(cos o)) f), S and C the albedos of sheen and coat.
+// Sheen: Estevez and Kulla, Production Friendly Microfacet Sheen BRDF, 2017, with the visibility of
+// Neubelt and Pettineo; scaled down where it would reflect more than all.
 #pragma once
 
 #include "lanes.h"
@@ -29,6 +37,16 @@ typedef struct {
     Float refract;
 #endif
     Float diffuse;
+#if LAYERS
+    Float coat;
+    Float under_coat;  // share of the light that coat and sheen leave to what is below
+    Float under_sheen;
+#endif
+#if GLOSSY
+    Float to_mirror[5]; // coefficients of mirror_albedo for this roughness
+    Float to_edge[4];   // and of edge_albedo
+    Float gain;         // what scattering between facets adds to a white mirror, relatively
+#endif
 } LobeChances;
 
 #if !GLOSSY
@@ -94,34 +112,118 @@ inline Float fresnel_dielectric(Float cosine, Float eta)
 }
 #endif
 
-/// Part of the light from one direction that the rough coat of `b` reflects into all directions.
-///
-/// E = F0 R + (F90 - F0) B, where R is the albedo of a GGX mirror and B that of the (1 - cos)^5 of
-/// Schlick's reflectance.  Both are fits to quadrature, rather from above: E is at most 0.012 too
-/// small; it is up to 0.13 too large within 15 degrees of the horizon, and 0.04 elsewhere.
-inline Float coat_albedo(Bsdf b, Float cosine)
+/// Sum of c[k] x^k.
+inline Float cubic(float c0, float c1, float c2, float c3, Float x)
 {
-    const Float x = 1.0f - cosine;
-    const Float x3 = x * x * x;
-    const Float x5 = x3 * x * x;
-    const Float mirror = 1.0f - 0.6f * b.alpha * (1.0f - 0.9f * x3);
-    const Float edge = x5 / (1.0f + b.alpha * (8.0f * b.alpha + 10.0f * x5 * x5));
-    return b.f0 * mirror + (b.specular - b.f0) * edge;
+    return c0 + x * (c1 + x * (c2 + x * c3));
 }
 
-/// Cosine-weighted mean of coat_albedo over the hemisphere, to 3e-4.
+// Fits to quadrature, as polynomials in s = cos / (cos + alpha), because a lobe near the horizon looks
+// the same for all alpha in it.  They err by 0.0055, and below a cosine of 0.02 by 0.018; that much is
+// added, for light must not be gained.
+
+/// Set up mirror_albedo for a roughness.
+inline void fit_mirror(Float alpha, Float *c)
+{
+    c[0] = cubic(0.026616f, -0.0581f, -0.009742f, 0.060876f, alpha);
+    c[1] = cubic(-0.348857f, 1.888125f, 3.694314f, -2.159958f, alpha);
+    c[2] = cubic(2.78666f, -9.259536f, -7.005814f, 8.277222f, alpha);
+    c[3] = cubic(-2.504882f, 12.704153f, 27.23154f, -26.873594f, alpha);
+    c[4] = cubic(-0.09363f, -6.105178f, -15.355658f, 18.573616f, alpha);
+}
+
+/// Part of the light that a white GGX mirror reflects, without scattering between facets.
+inline Float mirror_albedo(const Float *c, Float s, Float cosine)
+{
+    const Float lost = (1.0f - s) * (c[0] + s * (c[1] + s * (c[2] + s * (c[3] + s * c[4]))));
+    const Float safe = 0.0047f + 0.014f * max(1.0f - 50.0f * cosine, 0.0f);
+    return clamp(1.0f - lost + safe, (Float)(0.25f), (Float)(1.0f));
+}
+
+/// Set up edge_albedo for a roughness.
+inline void fit_edge(Float alpha, Float *c)
+{
+    const Float q = 1.0f / (1.0f + 8.0f * alpha);
+    c[0] = cubic(-0.027605f, 0.549456f, 0.104114f, 0.389766f, q);
+    c[1] = cubic(0.000757f, 1.614906f, -1.508364f, -0.885409f, q);
+    c[2] = cubic(-2.518936f, 7.571762f, -12.173236f, 8.51786f, q);
+    c[3] = cubic(4.750035f, -12.610544f, 16.317993f, -9.09099f, q);
+}
+
+/// Part of the light that GGX with a reflectance of (1 - cos)^5 reflects.
+inline Float edge_albedo(const Float *c, Float s, Float cosine)
+{
+    const Float cos2 = cosine * cosine;
+    const Float safe = 0.006f * (1.0f - cos2 * cos2) + 0.014f * max(1.0f - 50.0f * cosine, 0.0f);
+    return fifth_power_of_one_minus(cosine) * (c[0] + s * (c[1] + s * (c[2] + s * c[3]))) + safe;
+}
+
+/// Part of the light from one direction that the rough coat of `b` reflects into all directions.
+inline Float coat_albedo(Bsdf b, LobeChances c, Float cosine)
+{
+    const Float s = cosine / (cosine + b.alpha);
+    const Float mirror = b.f0 * mirror_albedo(c.to_mirror, s, cosine);
+    return min(mirror + (b.specular - b.f0) * edge_albedo(c.to_edge, s, cosine), (Float)(1.0f));
+}
+
+/// Cosine-weighted mean of coat_albedo over the hemisphere, to 5e-4.
 inline Float average_coat_albedo(Bsdf b)
 {
-    const Float mirror = 1.0f - 0.546f * b.alpha;
-    const Float edge = 1.0f / (21.0f + b.alpha * (27.0f + 165.0f * b.alpha));
-    return b.f0 * mirror + (b.specular - b.f0) * edge;
+    const Float r = sqrt(b.alpha);
+    const Float q = 1.0f / (1.0f + 8.0f * b.alpha);
+    const Float mirror =
+        1.006173f + r * (-0.043687f + r * (0.676312f + r * (-3.377032f + r * (2.783756f - 0.631296f * r))));
+    const Float edge =
+        0.005262f + q * (-0.049972f + q * (0.563542f + q * (-1.113004f + q * (0.986581f - 0.340664f * q))));
+    return b.f0 * min(mirror, (Float)(1.0f)) + (b.specular - b.f0) * edge;
 }
+
+#if LAYERS
+#define COAT_F0 0.04f // of an index of 1.5
+#define SHEEN_ROUGHNESS_MIN 0.3f
+
+/// Part of the light that the clear coat reflects.
+inline Float clear_coat_albedo(Float alpha, Float cosine)
+{
+    Float mirror[5];
+    Float edge[4];
+    fit_mirror(alpha, mirror);
+    fit_edge(alpha, edge);
+    const Float s = cosine / (cosine + alpha);
+    return COAT_F0 * mirror_albedo(mirror, s, cosine) + (1.0f - COAT_F0) * edge_albedo(edge, s, cosine);
+}
+
+/// What white sheen is scaled by, so that it nowhere reflects more than all: 1 from roughness 0.46 on.
+inline Float sheen_scale(Float roughness) { return 1.0f / max(2.2f - 2.6f * roughness, (Float)(1.0f)); }
+
+/// Part of the light that white sheen reflects: a fit that errs by 0.02, which is added.
+inline Float sheen_albedo(Float r, Float cosine)
+{
+    const Float s = cosine / (cosine + 0.3f);
+    const Float fit = cubic(3.085667f, -8.272625f, 9.952519f, -4.147989f, r)
+                      + s * (cubic(-7.221783f, 22.27487f, -27.769791f, 11.896124f, r)
+                             + s * (cubic(-1.031894f, 11.75999f, -14.565635f, 5.446236f, r)
+                                    + s * cubic(6.807946f, -35.550146f, 46.061533f, -19.107999f, r)));
+    return clamp((fit + 0.02f) * sheen_scale(r), (Float)(0.0f), (Float)(1.0f));
+}
+
+/// White sheen times cos i, without its scale.
+inline Float eval_sheen(Float roughness, Float cos_o, Float cos_i, Float cos_h)
+{
+    const Float inverse = 1.0f / (roughness * roughness);
+    const Float sine2 = max(1.0f - cos_h * cos_h, (Float)(1e-12f));
+    const Float d = (2.0f + inverse) * (0.5f * INV_PI) * native_exp(0.5f * inverse * native_log(sine2));
+    return d * cos_i / (4.0f * (cos_o + cos_i - cos_o * cos_i));
+}
+#endif
 
 /// Reflectance of the dielectric part of `b`, where its opaque share reflects `opaque`.
 inline Float dielectric_reflectance(Bsdf b, Float opaque, Float cosine)
 {
 #if TRANSMISSION
-    const Float clear = fresnel_dielectric(max(cosine, 1e-6f), b.eta) * b.specular;
+    Float clear = fresnel_dielectric(max(cosine, 1e-6f), b.eta);
+    // Between the two faces of a sheet light goes to and fro.
+    clear = pick(b.thin, 2.0f * clear / (1.0f + clear), clear) * b.specular;
     return opaque + (clear - opaque) * b.transmission;
 #else
     return opaque;
@@ -130,20 +232,37 @@ inline Float dielectric_reflectance(Bsdf b, Float opaque, Float cosine)
 
 LARGE_FUNCTION LobeChances lobe_chances(Bsdf b, Float cos_o)
 {
-    const Float f = dielectric_reflectance(b, coat_albedo(b, cos_o), cos_o);
+    LobeChances c;
+    fit_mirror(b.alpha, c.to_mirror);
+    fit_edge(b.alpha, c.to_edge);
+    const Float kept = mirror_albedo(c.to_mirror, cos_o / (cos_o + b.alpha), cos_o);
+    c.gain = (1.0f - kept) / kept;
+#if LAYERS
+    // The fit is of equal roughness; stretched highlights are raised less, rather than too much.
+    c.gain *= min(b.alpha, b.alpha_y) / max(b.alpha, b.alpha_y);
+    c.under_sheen = 1.0f - max3(b.sheen) * sheen_albedo(b.sheen_roughness, cos_o);
+    const Float coat = b.coat * clear_coat_albedo(b.coat_alpha, cos_o);
+    c.under_coat = c.under_sheen * (1.0f - coat);
+#endif
+    const Float f = dielectric_reflectance(b, coat_albedo(b, c, cos_o), cos_o);
     const Float color = max3(b.base_color);
     const Float metal_part = b.metallic * schlick(color, (Float)(1.0f), cos_o);
     const Float reflect = (1.0f - b.metallic) * f + metal_part;
     const Float below = (1.0f - b.metallic) * (1.0f - f);
-    LobeChances c;
 #if TRANSMISSION
-    const Float diffuse = below * (1.0f - b.transmission) * color;
+    Float diffuse = below * (1.0f - b.transmission) * color;
     const Float refract = below * b.transmission;
 #else
-    const Float diffuse = below * color;
+    Float diffuse = below * color;
     const Float refract = (Float)(0.0f);
 #endif
-    const Float sum = reflect + diffuse + refract;
+    Float sum = reflect + diffuse + refract;
+#if LAYERS
+    // Sheen is drawn as the base is.
+    diffuse += max3(b.sheen);
+    const Float coated = b.coat * schlick((Float)(COAT_F0), (Float)(1.0f), cos_o);
+    sum = reflect + diffuse + refract + coated;
+#endif
     const Float inverse = 1.0f / pick(sum > 0.0f, sum, (Float)(1.0f));
     // A lobe that exists keeps at least a tenth of the samples, or a wrong guess would make noise.
     const Float tenth = (Float)(0.1f);
@@ -153,9 +272,13 @@ LARGE_FUNCTION LobeChances lobe_chances(Bsdf b, Float cos_o)
     // Where the mean normal reflects all, tilted facets still let light through.
     const Float least = pick(refract > 0.0f, tenth, clamp(b.alpha, 0.1f * tenth, tenth));
     Float t = pick((1.0f - b.metallic) * b.transmission > 0.0f, max(refract * inverse, least), (Float)(0.0f));
-    const Float total = r + d + t;
+    Float total = r + d + t;
 #else
-    const Float total = r + d;
+    Float total = r + d;
+#endif
+#if LAYERS
+    const Float above = pick(b.coat > 0.0f, max(coated * inverse, tenth), (Float)(0.0f));
+    total += above;
 #endif
     const Float norm = 1.0f / pick(total > 0.0f, total, (Float)(1.0f));
     c.reflect = r * norm;
@@ -163,40 +286,92 @@ LARGE_FUNCTION LobeChances lobe_chances(Bsdf b, Float cos_o)
 #if TRANSMISSION
     c.refract = t * norm;
 #endif
+#if LAYERS
+    c.coat = above * norm;
+#endif
     return c;
 }
 
+// Alphas along x and y.
+#if LAYERS
+typedef struct {
+    Float x;
+    Float y;
+} Alphas;
+inline Alphas alphas_of(Bsdf b)
+{
+    Alphas a;
+    a.x = b.alpha;
+    a.y = b.alpha_y;
+    return a;
+}
+inline Alphas alphas_equal(Float alpha)
+{
+    Alphas a;
+    a.x = alpha;
+    a.y = alpha;
+    return a;
+}
+#define ALPHA_X(a) ((a).x)
+#define ALPHA_Y(a) ((a).y)
+#define ALPHA_LEAST(a) min((a).x, (a).y)
+#else
+typedef Float Alphas;
+inline Alphas alphas_of(Bsdf b) { return b.alpha; }
+#define ALPHA_X(a) (a)
+#define ALPHA_Y(a) (a)
+#define ALPHA_LEAST(a) (a)
+#endif
+
 /// GGX density of the microfacet normal `h` (local, unit).  From the slopes, because 1 - h.z^2 has
 /// cancelled away where the lobe is sharp.
-inline Float ggx_d(Vec3 h, Float alpha)
+inline Float ggx_d(Vec3 h, Alphas alpha)
 {
+#if LAYERS
+    const Float x = h.x / alpha.x;
+    const Float y = h.y / alpha.y;
+    const Float e = x * x + y * y + h.z * h.z;
+    return INV_PI / (alpha.x * alpha.y * e * e);
+#else
     const Float a2 = alpha * alpha;
     const Float e = (h.x * h.x + h.y * h.y) / a2 + h.z * h.z;
     return INV_PI / (a2 * e * e);
+#endif
 }
 
-/// Length of (alpha x, alpha y, z) for a unit vector with cosine z.
-inline Float ggx_stretch(Float z, Float alpha) { return sqrt(alpha * alpha * max(1.0f - z * z, 0.0f) + z * z); }
-
-/// Height-correlated masking and shadowing over 4 cos_o cos_i.
-inline Float ggx_visibility(Float cos_o, Float cos_i, Float alpha)
+/// Length of (alpha_x x, alpha_y y, z) for a unit vector.
+inline Float ggx_stretch(Vec3 w, Alphas alpha)
 {
-    return 0.5f / max(cos_o * ggx_stretch(cos_i, alpha) + cos_i * ggx_stretch(cos_o, alpha), 1e-20f);
+#if LAYERS
+    const Float x = alpha.x * w.x;
+    const Float y = alpha.y * w.y;
+    return sqrt(x * x + y * y + w.z * w.z);
+#else
+    return sqrt(alpha * alpha * max(1.0f - w.z * w.z, 0.0f) + w.z * w.z);
+#endif
+}
+
+/// Height-correlated masking and shadowing over 4 cos_o cos_i; wi.z > 0 is given apart.
+inline Float ggx_visibility(Vec3 wo, Vec3 wi, Float cos_i, Alphas alpha)
+{
+    const Vec3 i = vec3(wi.x, wi.y, cos_i);
+    return 0.5f / max(wo.z * ggx_stretch(i, alpha) + cos_i * ggx_stretch(wo, alpha), 1e-20f);
 }
 
 /// Share of the cap of visible normals that can reflect above the horizon (the k of Eto, Tokuyoshi).
-inline Float ggx_bound(Vec3 wo, Float alpha)
+inline Float ggx_bound(Vec3 wo, Alphas alpha)
 {
     const Float s = 1.0f + sqrt(max(1.0f - wo.z * wo.z, 0.0f));
-    const Float a2 = alpha * alpha;
+    const Float least = ALPHA_LEAST(alpha);
+    const Float a2 = least * least;
     const Float s2 = s * s;
     return (1.0f - a2) * s2 / (s2 + a2 * wo.z * wo.z);
 }
 
 /// Draw a microfacet normal visible from wo; `bound` is ggx_bound for a reflection, 1 for all of them.
-inline Vec3 sample_ggx(Vec3 wo, Float alpha, Float bound, Float u1, Float u2)
+inline Vec3 sample_ggx(Vec3 wo, Alphas alpha, Float bound, Float u1, Float u2)
 {
-    const Vec3 stretched = normalize3(vec3(alpha * wo.x, alpha * wo.y, wo.z));
+    const Vec3 stretched = normalize3(vec3(ALPHA_X(alpha) * wo.x, ALPHA_Y(alpha) * wo.y, wo.z));
     const Float lowest = bound * stretched.z;
     const Float z = (1.0f - u1) * (1.0f + lowest) - lowest;
     const Float radius = sqrt(clamp(1.0f - z * z, (Float)(0.0f), (Float)(1.0f)));
@@ -204,32 +379,47 @@ inline Vec3 sample_ggx(Vec3 wo, Float alpha, Float bound, Float u1, Float u2)
     Float s;
     cos_sin_turns(u2, &c, &s);
     const Vec3 h = vec3(radius * c + stretched.x, radius * s + stretched.y, z + stretched.z);
-    return normalize3(vec3(alpha * h.x, alpha * h.y, max(h.z, (Float)(1e-6f))));
+    return normalize3(vec3(ALPHA_X(alpha) * h.x, ALPHA_Y(alpha) * h.y, max(h.z, (Float)(1e-6f))));
 }
 
 /// Density of the direction that sample_ggx with ggx_bound reflects into.
-inline Float pdf_ggx_reflect(Vec3 wo, Vec3 h, Float alpha)
+inline Float pdf_ggx_reflect(Vec3 wo, Vec3 h, Alphas alpha)
 {
-    return ggx_d(h, alpha) / (2.0f * (ggx_bound(wo, alpha) * wo.z + ggx_stretch(wo.z, alpha)));
+    return ggx_d(h, alpha) / (2.0f * (ggx_bound(wo, alpha) * wo.z + ggx_stretch(wo, alpha)));
 }
 
-/// Factors of f cos of the diffuse base beside its colour: that of wo, and that of the light.
-inline Float base_gate(Bsdf b, Float cos_o)
+/// Factors of f cos of the diffuse base beside its colour and what lies over the coat: that of wo ...
+inline Float under_diffuse(Bsdf b, LobeChances chances, Float cos_o)
 {
     const Float stays = 1.0f - average_coat_albedo(b);
-    Float gate = (1.0f - b.metallic) * (1.0f - coat_albedo(b, cos_o)) / max(stays, 1e-6f);
+    Float under = (1.0f - b.metallic) * (1.0f - coat_albedo(b, chances, cos_o)) / max(stays, 1e-6f);
 #if TRANSMISSION
-    gate *= 1.0f - b.transmission;
+    under *= 1.0f - b.transmission;
 #endif
-    return gate;
+    return under;
 }
 
-inline Float base_light(Bsdf b, Float cos_i) { return (1.0f - coat_albedo(b, cos_i)) * cos_i * INV_PI; }
+/// ... and that of the light.
+inline Float base_light(Bsdf b, LobeChances chances, Float cos_i)
+{
+    return (1.0f - coat_albedo(b, chances, cos_i)) * cos_i * INV_PI;
+}
+
+/// Factor of wo of the diffuse base, beside its colour, under all that lies over it.
+inline Float base_gate(Bsdf b, LobeChances chances, Float cos_o)
+{
+    const Float under = under_diffuse(b, chances, cos_o);
+#if LAYERS
+    return under * chances.under_coat;
+#else
+    return under;
+#endif
+}
 
 /// Share of `f`, which eval_bsdf gave for wo and wi, that the diffuse base has.
-inline Vec3 base_share(Bsdf b, Float gate, Vec3 wi, Vec3 f)
+inline Vec3 base_share(Bsdf b, LobeChances chances, Float gate, Vec3 wi, Vec3 f)
 {
-    const Float under = pick(wi.z > 0.0f, gate * base_light(b, max(wi.z, 0.0f)), (Float)(0.0f));
+    const Float under = pick(wi.z > 0.0f, gate * base_light(b, chances, max(wi.z, 0.0f)), (Float)(0.0f));
     const Vec3 base = scale(b.base_color, under);
     const Float one = (Float)(1.0f);
     const Float zero = (Float)(0.0f);
@@ -243,64 +433,120 @@ inline Vec3 base_share(Bsdf b, Float gate, Vec3 wi, Vec3 f)
 /// `wi_side` > 0 where wi is on wo's side of the real surface: shading normals must not leak light.
 LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Float wi_side, Float *pdf)
 {
+    const Alphas alpha = alphas_of(b);
     const Mask above = (wi.z > 0.0f) & (wi_side > 0.0f);
-    const Float cos_i = pick(above, wi.z, (Float)(1.0f));
-    const Vec3 h = normalize3(add(wo, pick_v(above, wi, wo)));
+    Mask facing = above;
+#if TRANSMISSION
+    // Behind a sheet there is the mirror image of the reflection.
+    const Mask below = (wi.z < 0.0f) & (wi_side < 0.0f) & (chances.refract > 0.0f);
+    const Mask behind = below & b.thin;
+    facing |= behind;
+    const Vec3 beyond = wi;
+    wi.z = pick(behind, -wi.z, wi.z);
+#endif
+    const Float cos_i = pick(facing, wi.z, (Float)(1.0f));
+    const Vec3 h = normalize3(add(wo, pick_v(facing, wi, wo)));
     const Float cos_h = clamp(dot3(wo, h), (Float)(0.0f), (Float)(1.0f));
 
     const Float f = dielectric_reflectance(b, schlick(b.f0, b.specular, cos_h), cos_h);
     const Float edge = fifth_power_of_one_minus(cos_h);
-    const Vec3 metal = add_scaled(b.base_color, sub(vec3_all((Float)(1.0f)), b.base_color), edge);
-    const Vec3 fresnel = lerp3(vec3_all(f), metal, b.metallic);
-    const Float mirror = ggx_d(h, b.alpha) * ggx_visibility(wo.z, cos_i, b.alpha) * cos_i;
+    const Vec3 white = vec3_all((Float)(1.0f));
+    Vec3 metal = add_scaled(b.base_color, sub(white, b.base_color), edge);
+    metal = mul(metal, add_scaled(white, b.base_color, chances.gain));
+    Vec3 coat = vec3_all(f);
+#if LAYERS
+    coat = scale(add_scaled(b.tint, sub(white, b.tint), edge), f);
+#endif
+#if TRANSMISSION
+    const Float raised = 1.0f + pick(b.thin, chances.gain * b.transmission, (Float)(0.0f));
+    coat = scale(coat, raised);
+#endif
+    const Vec3 fresnel = lerp3(coat, metal, b.metallic);
+    const Float mirror = ggx_d(h, alpha) * ggx_visibility(wo, wi, cos_i, alpha) * cos_i;
 
-    const Float under = base_gate(b, wo.z) * base_light(b, cos_i);
+    const Float under = under_diffuse(b, chances, wo.z) * base_light(b, chances, cos_i);
     Vec3 value = add_scaled(scale(fresnel, mirror), b.base_color, under);
+    const Float seen_mirrored = pdf_ggx_reflect(wo, h, alpha);
     Float density = chances.diffuse * cos_i * INV_PI;
-    density += pick(chances.reflect > 0.0f, chances.reflect * pdf_ggx_reflect(wo, h, b.alpha), (Float)(0.0f));
+    density += pick(chances.reflect > 0.0f, chances.reflect * seen_mirrored, (Float)(0.0f));
+#if LAYERS
+    value = scale(value, chances.under_coat);
+    if (any_lane(above & (b.coat > 0.0f))) {
+        const Alphas a = alphas_equal(b.coat_alpha);
+        const Float coated = b.coat * chances.under_sheen * schlick((Float)(COAT_F0), (Float)(1.0f), cos_h)
+                             * ggx_d(h, a) * ggx_visibility(wo, wi, cos_i, a) * cos_i;
+        const Mask there = b.coat > 0.0f;
+        value = pick_v(there, add(value, vec3_all(coated)), value);
+        density += pick(there, chances.coat * pdf_ggx_reflect(wo, h, a), (Float)(0.0f));
+    }
+    const Mask fuzzy = above & (max3(b.sheen) > 0.0f);
+    if (any_lane(fuzzy)) {
+        const Float fuzz = sheen_scale(b.sheen_roughness) * eval_sheen(b.sheen_roughness, wo.z, cos_i, h.z);
+        value = pick_v(fuzzy, add_scaled(value, b.sheen, fuzz), value);
+    }
+#endif
 
 #if TRANSMISSION
-    // The generalised half vector points to the side of the lower index; h is turned to wo's side.
-    const Mask below = (wi.z < 0.0f) & (wi_side < 0.0f) & (chances.refract > 0.0f);
+    Mask passes = behind;
     if (any_lane(below)) {
-        Vec3 ht = normalize3(add_scaled(wo, wi, b.eta));
+        const Float share = (1.0f - b.metallic) * b.transmission;
+        const Float kept_back = fresnel_dielectric(cos_h, b.eta);
+        const Float sheet = (1.0f - 2.0f * kept_back / (1.0f + kept_back) * b.specular) * share * mirror * raised;
+        value = pick_v(behind, scale(b.base_color, sheet), value);
+        density = pick(behind, chances.refract * seen_mirrored, density);
+
+        // The generalised half vector points to the side of the lower index; h is turned to wo's side.
+        Vec3 ht = normalize3(add_scaled(wo, beyond, b.eta));
         ht = scale(ht, pick(ht.z < 0.0f, (Float)(-1.0f), (Float)(1.0f)));
         const Float oh = dot3(wo, ht);
-        const Float ih = dot3(wi, ht);
-        const Mask meets = below & (oh > 0.0f) & (ih < 0.0f);
+        const Float ih = dot3(beyond, ht);
+        const Mask meets = below & !b.thin & (oh > 0.0f) & (ih < 0.0f);
         const Float root = ih + oh / b.eta;
         const Float root2 = max(root * root, 1e-12f);
         const Float jacobian = fabs(ih) / root2;
-        const Float d = ggx_d(ht, b.alpha);
-        const Float cos_t = max(-wi.z, 1e-6f);
+        const Float d = ggx_d(ht, alpha);
+        const Float cos_t = max(-beyond.z, 1e-6f);
         // Masking times 1 / cos_o is 4 cos_i visibility; the radiance is compressed by 1 / eta^2.
-        const Float weight = d * 4.0f * cos_t * ggx_visibility(wo.z, cos_t, b.alpha) * max(oh, 0.0f)
+        const Float weight = d * 4.0f * cos_t * ggx_visibility(wo, beyond, cos_t, alpha) * max(oh, 0.0f)
                              * jacobian / (b.eta * b.eta);
-        const Float through = (1.0f - fresnel_dielectric(max(oh, 1e-6f), b.eta) * b.specular)
-                              * (1.0f - b.metallic) * b.transmission;
-        const Float seen = 2.0f * d * max(oh, 0.0f) / (wo.z + ggx_stretch(wo.z, b.alpha));
+        const Float through = (1.0f - fresnel_dielectric(max(oh, 1e-6f), b.eta) * b.specular) * share;
+        const Float seen = 2.0f * d * max(oh, 0.0f) / (wo.z + ggx_stretch(wo, alpha));
         value = pick_v(meets, scale(b.base_color, weight * through), value);
         density = pick(meets, chances.refract * seen * jacobian, density);
-        *pdf = pick(above | meets, density, (Float)(0.0f));
-        return pick_v(above | meets, value, vec3_all((Float)(0.0f)));
-    }
+        passes |= meets;
+#if LAYERS
+        value = pick_v(passes, scale(value, chances.under_coat), value);
 #endif
+    }
+    *pdf = pick(above | passes, density, (Float)(0.0f));
+    return pick_v(above | passes, value, vec3_all((Float)(0.0f)));
+#else
     *pdf = pick(above, density, (Float)(0.0f));
     return pick_v(above, value, vec3_all((Float)(0.0f)));
+#endif
 }
 
 /// What is left of a number in [0, 1) that has chosen the lobe: uniform in [0, 1) again.
 inline Float left_of_choice(LobeChances chances, Float u_lobe)
 {
-    const Mask diffuse = u_lobe < chances.diffuse;
-    Float low = pick(diffuse, (Float)(0.0f), chances.diffuse);
-    Float width = pick(diffuse, chances.diffuse, 1.0f - chances.diffuse);
+    // The lobes lie one after the other: diffuse, reflect, coat, refract.
+    Float low = (Float)(0.0f);
+    Float width = chances.diffuse;
+    Float next = chances.diffuse;
+    Mask later = u_lobe >= next;
+    low = pick(later, next, low);
+    width = pick(later, chances.reflect, width);
+    next += chances.reflect;
+#if LAYERS
+    later = (u_lobe >= next) & (chances.coat > 0.0f);
+    low = pick(later, next, low);
+    width = pick(later, chances.coat, width);
+    next += chances.coat;
+#endif
 #if TRANSMISSION
-    const Float second = chances.diffuse + chances.reflect;
-    const Mask refract = u_lobe >= second;
-    width = pick(diffuse | refract, width, chances.reflect);
-    low = pick(refract, second, low);
-    width = pick(refract, 1.0f - second, width);
+    later = u_lobe >= next;
+    low = pick(later, next, low);
+    width = pick(later, 1.0f - next, width);
 #endif
     return clamp((u_lobe - low) / max(width, 1e-6f), (Float)(0.0f), (Float)(0x1.fffffep-1f));
 }
@@ -313,13 +559,21 @@ LARGE_FUNCTION Vec3 sample_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Float u_lo
     if (!any_lane(glossy))
         return wi;
 
-#if TRANSMISSION
-    const Mask refract = glossy & (u_lobe >= chances.diffuse + chances.reflect);
-    const Float bound = pick(refract, (Float)(1.0f), ggx_bound(wo, b.alpha));
-#else
-    const Float bound = ggx_bound(wo, b.alpha);
+    Alphas alpha = alphas_of(b);
+    Float next = chances.diffuse + chances.reflect;
+#if LAYERS
+    const Mask coated = glossy & (u_lobe >= next) & (u_lobe < next + chances.coat);
+    alpha.x = pick(coated, b.coat_alpha, alpha.x);
+    alpha.y = pick(coated, b.coat_alpha, alpha.y);
+    next += chances.coat;
 #endif
-    const Vec3 h = sample_ggx(wo, b.alpha, bound, u1, u2);
+    Float bound = ggx_bound(wo, alpha);
+#if TRANSMISSION
+    const Mask through = glossy & (u_lobe >= next);
+    const Mask refract = through & !b.thin;
+    bound = pick(refract, (Float)(1.0f), bound);
+#endif
+    const Vec3 h = sample_ggx(wo, alpha, bound, u1, u2);
     const Float oh = dot3(wo, h);
     wi = pick_v(glossy, sub(scale(h, 2.0f * oh), wo), wi);
 #if TRANSMISSION
@@ -329,6 +583,7 @@ LARGE_FUNCTION Vec3 sample_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Float u_lo
     wi = pick_v(passes, bent, wi);
     // A draw that crosses its lobe's horizon has failed: it is not one of the other lobe's.
     wi.z = pick(refract, pick(passes, min(wi.z, 0.0f), (Float)(0.0f)), max(wi.z, 0.0f));
+    wi.z = pick(through & b.thin, -wi.z, wi.z);
 #endif
     return wi;
 }

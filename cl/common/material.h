@@ -121,9 +121,14 @@ LARGE_FUNCTION Float map_normal(
 }
 #endif
 
-/// Parameters of the BSDF in the lanes of `mask`.
+/// Parameters of the BSDF in the lanes of `mask`; `anisotropy` is map_normal's.
 LARGE_FUNCTION Bsdf fetch_bsdf(
-    Mask mask, SurfacePoint s, Float u, Float v, __global const Material *materials TEXTURE_PARAMETERS COLOR_PARAMETERS)
+    Mask mask,
+    SurfacePoint s,
+    Float u,
+    Float v,
+    Float anisotropy,
+    __global const Material *materials TEXTURE_PARAMETERS COLOR_PARAMETERS)
 {
     Bsdf b;
     b.base_color = GATHER_COLOR(materials, s.material, base_color);
@@ -145,6 +150,28 @@ LARGE_FUNCTION Bsdf fetch_bsdf(
 #endif
     b.alpha = max(roughness * roughness, ALPHA_GGX_MIN);
     b.specular = GATHER(materials, s.material, specular);
+#if LAYERS
+    b.tint = GATHER_COLOR(materials, s.material, specular_color);
+    b.coat = GATHER(materials, s.material, clearcoat);
+    Float coat_roughness = GATHER(materials, s.material, clearcoat_roughness);
+    b.sheen = GATHER_COLOR(materials, s.material, sheen_color);
+    b.sheen_roughness = GATHER(materials, s.material, sheen_roughness);
+#if TEXTURES
+    LOOK_UP(mask, s.material, specular_texture, &alpha);
+    b.specular *= alpha;
+    b.tint = mul(b.tint, LOOK_UP(mask, s.material, specular_color_texture, &alpha));
+    b.coat *= LOOK_UP(mask, s.material, clearcoat_texture, &alpha).x;
+    coat_roughness *= LOOK_UP(mask, s.material, clearcoat_roughness_texture, &alpha).y;
+    b.sheen = mul(b.sheen, LOOK_UP(mask, s.material, sheen_color_texture, &alpha));
+    LOOK_UP(mask, s.material, sheen_roughness_texture, &alpha);
+    b.sheen_roughness *= alpha;
+#endif
+    b.coat_alpha = max(coat_roughness * coat_roughness, ALPHA_GGX_MIN);
+    b.sheen_roughness = max(b.sheen_roughness, (Float)(SHEEN_ROUGHNESS_MIN));
+    // KHR_materials_anisotropy: rougher along the direction, as before across it.
+    b.alpha_y = b.alpha;
+    b.alpha += (1.0f - b.alpha) * anisotropy * anisotropy;
+#endif
     b.f0 = GATHER(materials, s.material, f0) * b.specular;
 #endif
 #if TRANSMISSION
@@ -153,7 +180,35 @@ LARGE_FUNCTION Bsdf fetch_bsdf(
     b.transmission *= LOOK_UP(mask, s.material, transmission_texture, &alpha).x;
 #endif
     const Float ior = GATHER(materials, s.material, ior);
-    b.eta = pick(s.front, ior, 1.0f / ior);
+    b.thin = (GATHER_U(materials, s.material, flags) & MATERIAL_THIN) != 0u;
+    b.eta = pick(s.front | b.thin, ior, 1.0f / ior);
 #endif
     return b;
 }
+
+#if TRANSMISSION
+/// e^x for x <= 0, to 1e-6: library calls are scalar on PoCL.
+inline Float exp_of_negative(Float x)
+{
+    const Float y = max(x * 1.44269504f, (Float)(-125.0f));
+    const Float whole = floor(y);
+    const Float z = (y - whole) * 0.69314718f;
+    const Float p =
+        1.0f
+        + z * (1.0f + z * (0.5f + z * (1.6666667e-1f + z * (4.1666667e-2f + z * (8.3333333e-3f + z * 1.3888889e-3f)))));
+    return p * from_bits(to_uint(whole + 127.0f) << 23);
+}
+
+/// What is left of light after `t` meters, where `s` was met from inside; Beer's law.
+inline Vec3 attenuation(Mask hit, SurfacePoint s, Float t, __global const Material *materials)
+{
+    const Mask thin = (GATHER_U(materials, s.material, flags) & MATERIAL_THIN) != 0u;
+    const Mask inside = hit & !s.front & !thin & (GATHER(materials, s.material, transmission) > 0.0f);
+    const Vec3 one = vec3_all((Float)(1.0f));
+    if (!any_lane(inside))
+        return one;
+    const Vec3 lost = scale(GATHER_COLOR(materials, s.material, absorption), -t);
+    const Vec3 left = vec3(exp_of_negative(lost.x), exp_of_negative(lost.y), exp_of_negative(lost.z));
+    return pick_v(inside, left, one);
+}
+#endif

@@ -24,13 +24,22 @@ typedef struct {
     Vec3 base_color;
 #if GLOSSY
     Float metallic;
-    Float alpha;      // GGX
+    Float alpha;      // GGX; along the tangent, if anisotropic
     Float f0;         // dielectric reflectance at normal incidence
     Float specular;   // dielectric F90
 #endif
 #if TRANSMISSION
     Float transmission;
     Float eta;        // index of the side of wi over that of wo, for a ray that goes through
+    Mask thin;        // a sheet: what goes through is not bent
+#endif
+#if LAYERS
+    Float alpha_y;    // along the bitangent
+    Vec3 tint;        // of the dielectric reflection at normal incidence
+    Float coat;
+    Float coat_alpha;
+    Vec3 sheen;
+    Float sheen_roughness;
 #endif
 } Bsdf;
 

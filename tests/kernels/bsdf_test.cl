@@ -1,7 +1,8 @@
 // The functions of bsdf.h, one material and one pair of directions a lane.
 //
-// materials: base colour (3), metallic, alpha, f0, specular, transmission, eta.
-// chances: reflect, refract, diffuse; of lobe_chances if the first is negative.
+// materials: base colour (3), metallic, alpha, f0, specular, transmission, eta, thin; with LAYERS also
+// tint (3), coat, its alpha, sheen (3), its roughness, alpha along y.
+// chances: reflect, refract, diffuse, coat; of lobe_chances if the first is negative.
 
 #include "planes.h"
 #include "../../cl/common/bsdf.h"
@@ -19,6 +20,15 @@ static inline Bsdf load_bsdf(global const float *materials)
 #if TRANSMISSION
     b.transmission = LOAD(materials, 7);
     b.eta = LOAD(materials, 8);
+    b.thin = LOAD(materials, 9) > 0.0f;
+#endif
+#if LAYERS
+    b.tint = LOAD_V(materials, 10);
+    b.coat = LOAD(materials, 13);
+    b.coat_alpha = LOAD(materials, 14);
+    b.sheen = LOAD_V(materials, 15);
+    b.sheen_roughness = LOAD(materials, 18);
+    b.alpha_y = LOAD(materials, 19);
 #endif
     return b;
 }
@@ -34,6 +44,9 @@ static inline LobeChances load_chances(global const float *chances, Bsdf b, Floa
     c.refract = pick(given, LOAD(chances, 1), c.refract);
 #endif
     c.diffuse = pick(given, LOAD(chances, 2), c.diffuse);
+#if LAYERS
+    c.coat = pick(given, LOAD(chances, 3), c.coat);
+#endif
     return c;
 }
 
@@ -51,6 +64,11 @@ kernel void list_chances(global const float *materials, global const float *wo, 
     STORE(chances, 1, (Float)(0.0f));
 #endif
     STORE(chances, 2, c.diffuse);
+#if LAYERS
+    STORE(chances, 3, c.coat);
+#else
+    STORE(chances, 3, (Float)(0.0f));
+#endif
 }
 
 /// left: what left_of_choice makes of the first of `numbers`.
