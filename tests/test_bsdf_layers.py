@@ -160,7 +160,7 @@ def random_record(rng):
         thin=bool(rng.random() < 0.4),
         tint=tuple(rng.random(3)),
         coat=often(0.0, 1.0),
-        coat_roughness=0.3 + 0.7 * rng.random(),
+        coat_roughness=0.5 + 0.5 * rng.random(),
         sheen=tuple(often(0.0) * rng.random(3)),
         sheen_roughness=rng.random(),
         anisotropy=often(0.0),
@@ -175,7 +175,7 @@ def test_samples_follow_their_density_for_200_random_materials(device):
     wo = np.array(
         [direction(c, phi) for c, phi in zip(cosines, rng.uniform(0, 6.28, 200), strict=True)]
     )
-    count, heights, turns, fine = 4096, 10, 8, 20
+    count, heights, turns, fine = 4096, 10, 8, 30
     # Midpoints of cells of equal solid angle; each bin has fine^2 of them.
     z = (np.arange(heights * fine) + 0.5) / (heights * fine) * 2 - 1
     phi = (np.arange(turns * fine) + 0.5) / (turns * fine) * 2 * np.pi
