@@ -242,7 +242,9 @@ class Renderer:
 
     def _image(self, names: set[str]) -> Image:
         x, y, width, height = self.plan.crop
-        partial = self.scheduler.passes == 0
+        # Of the device: after an interrupt the host has not seen its last passes.
+        counters = self.device.read(self.buffers["counters"], layout.COUNTER_INDEX["finished"])
+        partial = counters[layout.COUNTER_INDEX["film_pass"]] == 0
         order = self.order
         sums: dict[str, np.ndarray] = {}
         for ring, name, planes in film.PLANES:
@@ -299,12 +301,13 @@ class Renderer:
     def stats(self) -> dict[str, Any]:
         """Return what ``--stats`` writes, without errors against a reference."""
         counters = self.device.read(self.buffers["counters"], layout.COUNTER_INDEX["finished"])
+        passes = int(counters[layout.COUNTER_INDEX["film_pass"]])
         rays = {kind: layout.rays_so_far(counters, kind) for kind in layout.RAY_KINDS}
         stages = [{"name": name} | asdict(spent) for name, spent in self.device.totals.items()]
         return {
             "scene": self.scene.path,
-            "spp": self.scheduler.passes,
-            "passes": self.scheduler.passes,
+            "spp": passes,
+            "passes": passes,
             "render_seconds": self.scheduler.clock.now(),
             "build_seconds": self.build_seconds,
             "compile_seconds": self.compile_seconds,

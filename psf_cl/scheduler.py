@@ -19,6 +19,9 @@ BATCH_SECONDS = 0.05
 MAX_BOUNCES = 256
 RAYS_PER_BOUNCE = 1.7
 
+#: Passes of a render that has no number of them: counters of passes have 32 bits.
+MAX_PASSES = 1 << 31
+
 #: Bounces between two looks of the film at the ring of samples.
 BOUNCES_PER_FILM = 4
 
@@ -108,10 +111,10 @@ class Scheduler:
         first_samples, last_rays = self.rays["camera"], sum(self.rays.values())
         first_seconds = self.clock.now()
         limit = spp
-        self.hooks.limit(limit if limit is not None else 0xFFFFFFFF)
+        self.hooks.limit(limit if limit is not None else MAX_PASSES)
         self.clock.start()
         try:
-            while limit is None or self.passes < limit:
+            while self.passes < (MAX_PASSES if limit is None else limit):
                 begin = time.perf_counter()
                 for bounce in range(self.bounces):
                     self.hooks.bounce()
@@ -131,7 +134,7 @@ class Scheduler:
                         return False
                 if seconds is not None and limit is None and now >= seconds:
                     # The pass in which the budget ends is finished; later ones are not begun.
-                    limit = self.passes + 1
+                    limit = min(self.passes + 1, MAX_PASSES)
                     self.hooks.limit(limit)
             return True
         finally:

@@ -22,10 +22,11 @@ typedef JOIN(int, W) Mask;
 #error "W must be 1, 8 or 16"
 #endif
 
-// any() of PoCL looks at one lane after the other: twice the time in a loop over triangles.
+// any() of PoCL looks at one lane after the other: twice the time in a loop over triangles.  Only where
+// lanes make a CPU likely: other compilers may not know what to do with the builtin.
 #define ANY(mask) any(mask)
 #ifdef __has_builtin
-#if __has_builtin(__builtin_reduce_or)
+#if W > 1 && __has_builtin(__builtin_reduce_or)
 #define REDUCE_OR(mask) __builtin_reduce_or(mask)
 #undef ANY
 #define ANY(mask) (REDUCE_OR(mask) != 0)

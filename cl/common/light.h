@@ -126,7 +126,7 @@ inline Float area_light_density(__global const Light *lights, UInt light, Float 
 }
 #endif
 
-/// Draw a light, then a direction to it, from point `p` whose ray origin is `origin`.
+/// Draw a light, then a direction to it, for rays that start at `origin`.
 ///
 /// pdf is 0 where nothing arrives.  `seed`, `reversed_index` and `pair` (the vertex's first) name the numbers.
 LARGE_FUNCTION LightSample sample_light(

@@ -1,4 +1,4 @@
-// One ray through the tree.  Define STACK_SIZE (Bvh.stack_size), and include alpha.h before.
+// Rays through the tree.  Define STACK_SIZE (Bvh.stack_size), and include alpha.h before.
 #pragma once
 
 #include "geometry.h"

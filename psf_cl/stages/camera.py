@@ -31,8 +31,8 @@ def plan(context: Context) -> StageSpec:
         "regenerate_paths",
         reads=(*started, *named, *shared),
         writes=(*started, *named),
-        # An entry of the order of pixels, and a weighted sample a plane.
-        record_bytes=4 + 16 * (1 + len(direct) + context.on("CELLS")),
+        # A weighted sample a plane.
+        record_bytes=16 * (1 + len(direct) + context.on("CELLS")),
         runs=True,
     )
     return StageSpec(
