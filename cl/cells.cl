@@ -45,7 +45,8 @@ inline CellSamples load_cell_samples(
     s.query.p = vec3(GATHER(vertices, s.pixel, p[0]), GATHER(vertices, s.pixel, p[1]),
                      GATHER(vertices, s.pixel, p[2]));
     s.query.ng = unpack_unit(GATHER_U(vertices, s.pixel, ng));
-    s.query.seen = vertex == 1u;
+    s.query.seen = (vertex & VERTEX_MASK) == 1u;
+    s.query.near = params->cell_flags & CELL_NEAR ? vertex >> 31 : (UInt)(0u);
     s.query.extra = params->cell_flags & CELL_IDENTITY ? s.pixel + 1u : (UInt)(0u);
     const float shrunk = params->cell_width * exp2(params->cell_shrink * log2((float)(pass + 1u)));
     s.query.width = GATHER(vertices, s.pixel, length) * shrunk;

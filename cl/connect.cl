@@ -27,12 +27,13 @@ inline uint connect_paths(__global const Params *params, __global Float *path, G
                        - pick_u((status & STATUS_MASK) == STATUS_ALIVE, (UInt)(1u), (UInt)(0u));
 #endif
 #if CELLS
+    const UInt vertex = get_u(path, PATH_VERTEX) & VERTEX_MASK;
 #if CELLS == 2
     const Vec3 share = get_v(path, PATH_LIGHT_SHARE_R);
 #else
     const Vec3 share = vec3_all((Float)(1.0f));
 #endif
-    gather_light(path, shares_connection(params, get_u(path, PATH_VERTEX), depth), share, arrives);
+    gather_light(path, shares_connection(params, vertex, depth), share, arrives);
 #else
     put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), arrives));
 #endif

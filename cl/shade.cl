@@ -165,11 +165,12 @@ kernel void shade_paths(
 
     const Vec3 brought = pick_v(alive, mul(beta, emitted), zero);
 #if CELLS
-    UInt vertex = pick_u(camera_ray, (UInt)(0u), get_u(path, PATH_VERTEX));
+    const UInt known = pick_u(camera_ray, (UInt)(0u), get_u(path, PATH_VERTEX));
+    const UInt vertex = known & VERTEX_MASK;
     const Float length = pick(camera_ray, (Float)(0.0f), FIELD(path, PATH_LENGTH)) + FIELD(path, PATH_HIT_T);
     FIELD(path, PATH_LENGTH) = length;
     put_v(path, PATH_BEYOND_R, pick_v(camera_ray, zero, get_v(path, PATH_BEYOND_R)));
-    put_u(path, PATH_VERTEX, vertex);
+    put_u(path, PATH_VERTEX, known | near_bit(params, hit, vertex, depth, length, FIELD(path, PATH_HIT_T)));
 #if CELLS == 2
     Vec3 share = get_v(path, PATH_SHARE_R);
     gather_light(path, shares_emission(params, vertex, depth), share, brought);
@@ -229,8 +230,7 @@ kernel void shade_paths(
                         & wants_cell(params, depth, length, FIELD(path, PATH_HIT_T), pdf_bsdf);
     if (any_lane(chosen)) {
         store_cell_vertices(params, vertices, chosen, sample, pixel, s.p, s.ng, gate, length);
-        vertex = pick_u(chosen, depth + 1u, vertex);
-        put_u(path, PATH_VERTEX, vertex);
+        put_u(path, PATH_VERTEX, pick_u(chosen, depth + 1u, get_u(path, PATH_VERTEX)));
     }
 #endif
 

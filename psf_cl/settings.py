@@ -73,9 +73,12 @@ class Settings:
     filter_direct: bool = _switch(
         True, doc="share the light too that falls on that vertex directly"
     )
-    cell_size: float = _number(8.0, 1e-3, 1e6, doc="edge of a cell in the first pass, pixels")
+    cell_size: float = _number(16.0, 1e-3, 1e6, doc="edge of a cell in the first pass, pixels")
     cell_jitter: bool = _switch(
         True, doc="move points at random before cells are told apart: no blocks show"
+    )
+    cell_near: bool = _switch(
+        True, doc="tell light from within a cell apart from light from afar: contacts stay dark"
     )
     cell_shrink: bool = _switch(
         True, doc="make cells smaller from pass to pass: consistent; else the image stays blurred"
@@ -142,7 +145,8 @@ def _checked(item: dataclasses.Field[Any], value: Any, prefix: str) -> Any:
 
 PRESETS: dict[str, dict[str, Any]] = {
     "pt": {},
-    "psf": {"path_filter": "hash_grid"},
+    # Shadows of direct light are sharper than any cell; all other light is shared where it is seen.
+    "psf": {"path_filter": "hash_grid", "filter_vertex": "1", "filter_direct": False},
 }
 
 

@@ -10,6 +10,7 @@ from scene_builder import build, camera, floor, glowing, lambertian, render, ren
 
 from psf_cl.device import layout
 from psf_cl.device.device import open_device
+from psf_cl.errors import InputError
 from psf_cl.plan import make_plan
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.model import Environment, Material
@@ -164,7 +165,7 @@ def test_a_plane_equals_a_model_of_its_cells(device):
         opened.device.read(opened.buffers[name])[: len(pixels)] for name in ("beyond", "vertices")
     )
     opened.close()
-    low = (beyond["vertex"] == 1) & (np.abs(vertices["p"][:, 1]) < 1e-3)
+    low = (beyond["vertex"] & 0x7FFFFFFF == 1) & (np.abs(vertices["p"][:, 1]) < 1e-3)
     assert low.sum() > 1500
     gate = vertices["gate"][low].astype(np.float64)
     np.testing.assert_allclose(gate, np.broadcast_to((0.5, 0.6, 0.7), gate.shape), rtol=1e-6)
@@ -299,3 +300,37 @@ def test_a_mirror_image_stays_sharp_under_the_filter(device):
     filtered = render(device, scene, 4, **FILTER, filter_vertex="1", cell_size=64.0)
     assert filtered.stats["cells"]["cells_per_pass"] == 0
     np.testing.assert_array_equal(filtered.rgb, render(device, scene, 4).rgb)
+
+
+def test_a_slit_under_a_plate_stays_dark(device):
+    """Floor that only near light reaches: the open floor beside it must not light it up."""
+    plate = transform.translation((0, 0.05, 0)) @ transform.scaling((0.5, 0.02, 0.5))
+    scene = build(
+        [floor(3.0, lambertian(0.5)), (primitives.box(), plate, lambertian(0.5))],
+        camera((0, 0.04, 3), (0, 0.02, 0), 12),
+        (64, 64),
+        environment=1.0,
+    )
+    truth = render(device, scene, 256).rgb.mean(axis=-1)
+    slit = truth < 0.1 * truth.max()
+    assert slit.sum() > 50
+    bias = {}
+    for near in (False, True):
+        settings = {**FILTER, "filter_vertex": "1", "cell_near": near}
+        bias[near] = render(device, scene, 16, (), **settings).rgb.mean(axis=-1)[slit].mean()
+        bias[near] -= truth[slit].mean()
+    assert bias[False] > 0.005 and abs(bias[True]) < 0.4 * bias[False]
+
+
+@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "x"])
+def test_cells_without_size_are_refused(value):
+    with pytest.raises(InputError, match=r"cell_size must be"):
+        Settings().with_values({"cell_size": value})
+
+
+def test_switches_and_numbered_choices_are_read_from_text_and_files():
+    settings = Settings().with_values({"filter_direct": "false", "filter_vertex": 2})
+    assert settings.filter_direct is False and settings.filter_vertex == "2"
+    for values in ({"filter_direct": "maybe"}, {"filter_direct": 1}, {"filter_vertex": 0}):
+        with pytest.raises(InputError):
+            Settings().with_values(values)

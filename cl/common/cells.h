@@ -13,6 +13,7 @@ typedef struct {
     Vec3 ng;
     Float width;      // wanted edge of the cell, m
     Mask seen;        // the camera sees the point: the edge follows its distance
+    UInt near;        // 1: its light comes from near
     UInt extra;       // told apart in addition; 0 for nothing
 } CellQuery;
 
@@ -84,7 +85,7 @@ inline CellKey cell_of(__global const Params *params, CellQuery q, UInt random_x
     index = mix_bits(index + x);
     index = mix_bits(index + y);
     index = mix_bits(index + z);
-    UInt print = mix_bits_too(level + cube_face(q.ng) * 0x01000193u + q.extra * 0x85ebca6bu);
+    UInt print = mix_bits_too(level + (cube_face(q.ng) + 8u * q.near) * 0x01000193u + q.extra * 0x85ebca6bu);
     print = mix_bits_too(print ^ x);
     print = mix_bits_too(print ^ y);
     print = mix_bits_too(print ^ z);

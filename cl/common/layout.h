@@ -36,7 +36,10 @@
 #define DEPTH_MASK 0x3FFFFFFFu // bounces so far
 #define FILTER_AUTO 0u // the first vertex that a wide lobe reached, over more than a cell
 #define FILTER_NONE 0xFFFFFFFFu // no vertex
+#define VERTEX_NEAR 0x80000000u // set if the path met a surface within a cell of its vertex
+#define VERTEX_MASK 0x7FFFFFFFu // 1 + depth
 #define CELL_JITTER 1u // points are moved before they are told apart by cells
+#define CELL_NEAR 4u // samples of light from near have cells of their own
 #define CELL_IDENTITY 2u // every sample has a cell of its own: nothing is shared (tests)
 #define BUCKET_SLOTS 64u // slots of a hash map that are probed for a key
 
@@ -74,7 +77,7 @@
 #define PATH_LIGHT_G 31u
 #define PATH_LIGHT_B 32u
 #if CELLS >= 1
-#define PATH_VERTEX (33u + 0u) // uint; 1 + depth of the vertex behind which light is shared; 0: none yet
+#define PATH_VERTEX (33u + 0u) // uint; 1 + depth of the vertex behind which light is shared, VERTEX_NEAR; 0: none
 #define PATH_LENGTH (33u + 1u) // m, from the camera on
 #define PATH_BEYOND_R (33u + 2u) // of what was gathered, what is shared: it came from beyond that vertex
 #define PATH_BEYOND_G (33u + 3u)
@@ -153,7 +156,7 @@ typedef struct {
     uint corner_count; // of the list of corners, where all triangles are tested
     uint face_count; // triangles between those corners
     uint cell_slots; // of the table of cells of one pass, a power of two
-    uint cell_flags; // CELL_JITTER, CELL_IDENTITY
+    uint cell_flags; // CELL_JITTER, CELL_NEAR, CELL_IDENTITY
     float cell_width; // edge of a cell in the first pass, m per m of the path
     float cell_shrink; // exponent of the number of the pass in the edge of a cell
     float cell_steps; // fixed-point steps of a sum of radiance per unit, a power of two
@@ -330,7 +333,7 @@ typedef struct {
 /// What a sample gathered behind its cell's vertex.
 typedef struct {
     float radiance[3]; // at the camera
-    uint vertex; // 1 + its depth, 0 if there is none
+    uint vertex; // 1 + its depth, VERTEX_NEAR; 0 if there is none
 } Beyond;
 
 /// What a cell gathers: 64-bit fixed-point sums.

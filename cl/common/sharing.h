@@ -40,6 +40,17 @@ inline Mask wants_cell(__global const Params *params, UInt depth, Float length, 
     return (depth > 0u) & (distance * distance > width * width * max(spread, 3.0f));
 }
 
+/// VERTEX_NEAR where the path has just met a surface within a cell of the vertex whose light it shares.
+///
+/// In corners and slits the light changes within a cell; samples of near and of far light have cells of
+/// their own, so that each place gets both in the parts in which it sees them.
+inline UInt near_bit(
+    __global const Params *params, Mask hit, UInt vertex, UInt depth, Float length, Float distance)
+{
+    const Mask next = hit & (vertex != 0u) & (depth == vertex);
+    return pick_u(next & (distance < params->cell_width * (length - distance)), (UInt)(VERTEX_NEAR), (UInt)(0u));
+}
+
 /// Hand in the vertices of the lanes in `chosen`.
 inline void store_cell_vertices(
     __global const Params *params,

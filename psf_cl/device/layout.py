@@ -91,7 +91,7 @@ PARAMS = Record(
     uint corner_count - of the list of corners, where all triangles are tested
     uint face_count - triangles between those corners
     uint cell_slots - of the table of cells of one pass, a power of two
-    uint cell_flags - CELL_JITTER, CELL_IDENTITY
+    uint cell_flags - CELL_JITTER, CELL_NEAR, CELL_IDENTITY
     float cell_width - edge of a cell in the first pass, m per m of the path
     float cell_shrink - exponent of the number of the pass in the edge of a cell
     float cell_steps - fixed-point steps of a sum of radiance per unit, a power of two
@@ -313,7 +313,7 @@ BEYOND = Record(
     "What a sample gathered behind its cell's vertex.",
     _fields("""
     float radiance[3] - at the camera
-    uint vertex - 1 + its depth, 0 if there is none
+    uint vertex - 1 + its depth, VERTEX_NEAR; 0 if there is none
     """),
 )
 
@@ -391,7 +391,10 @@ OPTIONAL_PATH_FIELDS = (
         "CELLS",
         1,
         (
-            ("vertex", "uint; 1 + depth of the vertex behind which light is shared; 0: none yet"),
+            (
+                "vertex",
+                "uint; 1 + depth of the vertex behind which light is shared, VERTEX_NEAR; 0: none",
+            ),
             ("length", "m, from the camera on"),
             ("beyond_r", "of what was gathered, what is shared: it came from beyond that vertex"),
             ("beyond_g", ""),
@@ -474,7 +477,10 @@ CONSTANTS = (
     ("DEPTH_MASK", 0x3FFFFFFF, "bounces so far"),
     ("FILTER_AUTO", 0, "the first vertex that a wide lobe reached, over more than a cell"),
     ("FILTER_NONE", 0xFFFFFFFF, "no vertex"),
+    ("VERTEX_NEAR", 0x80000000, "set if the path met a surface within a cell of its vertex"),
+    ("VERTEX_MASK", 0x7FFFFFFF, "1 + depth"),
     ("CELL_JITTER", 1, "points are moved before they are told apart by cells"),
+    ("CELL_NEAR", 4, "samples of light from near have cells of their own"),
     ("CELL_IDENTITY", 2, "every sample has a cell of its own: nothing is shared (tests)"),
     ("BUCKET_SLOTS", 64, "slots of a hash map that are probed for a key"),
 )

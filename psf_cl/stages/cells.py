@@ -16,8 +16,8 @@ from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
 #: A sample may be so many times as bright as the brightest light before it is not shared.
 HEADROOM = 1024.0
 
-#: Cells of pass n have the edge n^(-1/6) of those of pass 1: bias falls as n^(-1/3), variance
-#: as 1 / n.
+#: Cells of pass n have the edge n^(-1/6) of those of pass 1: bias falls as n^(-1/3), and so
+#: does the noise, n^(-2/3) in variance.
 #: Knaus, Zwicker: Progressive Photon Mapping: A Probabilistic Approach, 2011 (alpha = 2/3).
 SHRINK_EXPONENT = -1.0 / 6.0
 
@@ -43,7 +43,8 @@ def parameters(scene: Scene, settings: Settings, pixel_count: int) -> dict[str, 
     steps = fixed_point(HEADROOM * brightest(scene), pixel_count)
     return {
         "cell_slots": slots_of(pixel_count),
-        "cell_flags": layout.CONSTANT["CELL_JITTER"] * settings.cell_jitter,
+        "cell_flags": layout.CONSTANT["CELL_JITTER"] * settings.cell_jitter
+        + layout.CONSTANT["CELL_NEAR"] * settings.cell_near,
         "cell_width": settings.cell_size * pixel,
         "cell_shrink": SHRINK_EXPONENT if settings.cell_shrink else 0.0,
         "cell_steps": steps,
