@@ -344,7 +344,7 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
 
     What is on keeps its value: as an image of one texel a constant sky would be sampled otherwise.
     """
-    most = {"ENVIRONMENT": 2, "CELLS": 2}
+    most = {"ALPHA": 2, "ENVIRONMENT": 2, "CELLS": 2}
     full = {
         name: feature
         if feature.value

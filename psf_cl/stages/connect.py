@@ -14,9 +14,12 @@ def plan(context: Context) -> StageSpec | None:
     moved = ("vertex", "status") if context.on("CELLS") else ()
     if context.features["CELLS"].value == 2:
         moved = (*moved, "light_share")
+    # What blends by chance has random numbers of its path.
+    numbers = ("seed", "sample", "status") if context.features["ALPHA"].value == 2 else ()
+    reads = ("light", "shadow", "toward", "radiance", *direct, *shared, *moved, *numbers)
     kernel = KernelSpec(
         "connect_lights",
-        reads=("light", "shadow", "toward", "radiance", *direct, *shared, *moved),
+        reads=tuple(dict.fromkeys(reads)),
         writes=("light", "radiance", *direct[:1], *shared),
         rays=("shadow",),
         runs=True,

@@ -7,9 +7,11 @@ from psf_cl.stages.spec import Context, KernelSpec, StageSpec
 
 def plan(context: Context) -> StageSpec:
     """Return the stage; every render has it."""
+    # What blends by chance has random numbers of its path.
+    numbers = ("seed", "sample") if context.features["ALPHA"].value == 2 else ()
     kernel = KernelSpec(
         "intersect_closest",
-        reads=("status", "origin", "direction"),
+        reads=("status", "origin", "direction", *numbers),
         writes=("hit",),
         rays=("camera", "bounce"),
         runs=True,
