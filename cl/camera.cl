@@ -9,7 +9,7 @@
 
 /// Exponent bits of the largest of three numbers; tested on bits, for a compiler may assume that no
 /// float is NaN.
-inline UInt exponent_bits(Vec3 v)
+static inline UInt exponent_bits(Vec3 v)
 {
     return max(as_bits(v.x) & 0x7f800000u, max(as_bits(v.y) & 0x7f800000u, as_bits(v.z) & 0x7f800000u));
 }
@@ -18,7 +18,7 @@ inline UInt exponent_bits(Vec3 v)
 #define MAX_EXPONENT_BITS 0x6f800000u
 
 /// Slots that have nothing to do but take the next sample.
-inline Mask is_free(UInt status)
+static inline Mask is_free(UInt status)
 {
     return ((status & STATUS_MASK) == STATUS_DONE) | ((status & STATUS_MASK) == STATUS_IDLE);
 }
@@ -30,7 +30,7 @@ typedef struct {
     uint started;  // paths
 } Tally;
 
-inline void hand_in(Tally *tally, volatile __global uint *counters)
+static inline void hand_in(Tally *tally, volatile __global uint *counters)
 {
     if (tally->finished > 0)
         atomic_add(&counters[COUNTER_FINISHED + tally->pass], tally->finished);
@@ -40,7 +40,7 @@ inline void hand_in(Tally *tally, volatile __global uint *counters)
 /// Regenerate the W paths of a work item.
 ///
 /// `claimed` is the next entry of the queue that is theirs; returns the one after the last they took.
-inline uint regenerate(
+static inline uint regenerate(
     __global const Params *params,
     __global Float *path,
     uint claimed,

@@ -23,7 +23,7 @@ typedef struct {
     CellQuery query;
 } CellSamples;
 
-inline CellSamples load_cell_samples(
+static inline CellSamples load_cell_samples(
     __global const Params *params,
     __global const Beyond *beyond,
     __global const CellVertex *vertices,
@@ -60,7 +60,7 @@ inline CellSamples load_cell_samples(
 }
 
 /// Random bits of the samples for one purpose.
-inline void cell_random(
+static inline void cell_random(
     __global const Params *params, UInt pixel, uint pass, uint pair, UInt *a, UInt *b)
 {
     UInt x;

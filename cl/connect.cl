@@ -8,7 +8,7 @@
 #include "common/sharing.h"
 
 /// Trace the shadow rays of the W paths of a work item; returns how many there were.
-inline uint connect_paths(__global const Params *params, __global Float *path, GEOMETRY_BUFFERS)
+static inline uint connect_paths(__global const Params *params, __global Float *path, GEOMETRY_BUFFERS)
 {
     const Vec3 light = get_v(path, PATH_LIGHT_R);
     // Not a number must not vanish here: it goes on into the sample, which is rejected and counted.

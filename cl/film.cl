@@ -4,7 +4,7 @@
 #include "common/passes.h"
 
 /// Add one value to a compensated sum, so that the millionth sample still counts (Kahan 1965).
-inline void add_compensated(FilmSum *sum, uint c, float value)
+static inline void add_compensated(FilmSum *sum, uint c, float value)
 {
     const float y = value - sum->lost[c];
     const float t = sum->sum[c] + y;
@@ -12,7 +12,7 @@ inline void add_compensated(FilmSum *sum, uint c, float value)
     sum->sum[c] = t;
 }
 
-inline void add_sample(FilmSum *sum, float4 sample)
+static inline void add_sample(FilmSum *sum, float4 sample)
 {
     if (sample.w <= 0.0f)
         return;
@@ -65,7 +65,7 @@ kernel void add_samples(
 /// Halves have to differ as independent renders would.  Every other Sobol' point would not do: these
 /// are opposites in the first dimension.  Runs of about sqrt(pass) points have each half the pattern
 /// of a whole sequence; the halves are equal whenever the number of passes is a power of two.
-inline int pass_is_in_half(uint pass)
+static inline int pass_is_in_half(uint pass)
 {
     return (pass >> ((31u - clz(pass | 1u)) >> 1)) & 1u;
 }

@@ -7,7 +7,7 @@
 #include "common/trace.h"
 
 /// Trace the rays of the W paths of work item `item`; returns how many rays had bounced.
-inline uint trace_paths(__global const Params *params, __global Float *path, GEOMETRY_BUFFERS)
+static inline uint trace_paths(__global const Params *params, __global Float *path, GEOMETRY_BUFFERS)
 {
     const UInt status = get_u(path, PATH_STATUS);
     const Mask alive = (status & STATUS_MASK) == STATUS_ALIVE;

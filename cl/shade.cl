@@ -15,7 +15,7 @@
 #define MAX_SURVIVAL 0.95f
 
 /// Weight of emission that a BSDF-sampled ray found, against sampling the light.
-inline Float emission_weight(__global const Params *params, Mask camera_ray, Float pdf_bsdf, Float pdf_light)
+static inline Float emission_weight(__global const Params *params, Mask camera_ray, Float pdf_bsdf, Float pdf_light)
 {
     Float weight = (Float)(1.0f);
     if (params->direct_sampling == DIRECT_MIS)
@@ -27,7 +27,7 @@ inline Float emission_weight(__global const Params *params, Mask camera_ray, Flo
 
 #if AOV_FEATURES
 /// Hand in what the first surface looks like: albedo, normal, depth (planes of weighted values).
-inline void store_features(
+static inline void store_features(
     __global const Params *params,
     __global float *features,
     Mask mask,

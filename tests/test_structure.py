@@ -135,6 +135,12 @@ def test_setup_lists_every_package_and_dependency():
 
 
 @pytest.mark.parametrize("path", KERNEL_FILES, ids=lambda path: path.name)
+def test_inline_functions_are_static(path):
+    """Else OpenCL C emits none of them, and a call that is not inlined has nothing to call."""
+    assert not re.findall(r"^inline\b.*", path.read_text(), re.MULTILINE)
+
+
+@pytest.mark.parametrize("path", KERNEL_FILES, ids=lambda path: path.name)
 def test_kernels_have_no_doubles_and_no_64_bit_atomics(path):
     code = code_of(path)
     # A literal without f makes the whole expression double where the device has doubles.

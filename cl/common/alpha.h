@@ -26,7 +26,7 @@
 #endif
 
 /// Opacity of a triangle at barycentrics (u, v).
-inline float opacity(
+static inline float opacity(
     __global const Material *material, uint triangle, float u, float v TEXTURE_PARAMETERS COLOR_PARAMETERS)
 {
     float alpha = material->alpha;
@@ -40,7 +40,7 @@ inline float opacity(
 }
 
 /// Whether a hit on the triangle at barycentrics (u, v) is there.
-inline int alpha_passes(uint triangle, float u, float v ALPHA_PARAMETERS)
+static inline int alpha_passes(uint triangle, float u, float v ALPHA_PARAMETERS)
 {
     __global const Material *material = &materials[surfaces[triangle].material];
     const float alpha = opacity(material, triangle, u, v TEXTURE_ARGUMENTS COLOR_ARGUMENTS);
@@ -57,7 +57,7 @@ inline int alpha_passes(uint triangle, float u, float v ALPHA_PARAMETERS)
 }
 
 /// The same for the lanes of `mask`, true also where the material is opaque.
-inline Mask alpha_passes_lanes(Mask mask, UInt triangle, Float u, Float v ALPHA_PARAMETERS)
+static inline Mask alpha_passes_lanes(Mask mask, UInt triangle, Float u, Float v ALPHA_PARAMETERS)
 {
     const UInt material = GATHER_U(surfaces, triangle, material);
     mask &= (GATHER_U(materials, material, flags) & (MATERIAL_ALPHA_MASK | MATERIAL_ALPHA_BLEND)) != 0u;
@@ -78,7 +78,7 @@ inline Mask alpha_passes_lanes(Mask mask, UInt triangle, Float u, Float v ALPHA_
 }
 
 /// Share of the light that points of the lanes of `mask` block or give: 0 or 1 for a mask.
-inline Float alpha_share(Mask mask, UInt triangle, Float u, Float v ALPHA_BUFFERS)
+static inline Float alpha_share(Mask mask, UInt triangle, Float u, Float v ALPHA_BUFFERS)
 {
     const UInt material = GATHER_U(surfaces, triangle, material);
     const UInt flags = GATHER_U(materials, material, flags);

@@ -52,25 +52,25 @@ typedef struct {
 #if !GLOSSY
 // Nothing but the base: a scene of matt materials.
 
-inline LobeChances lobe_chances(Bsdf b, Float cos_o)
+static inline LobeChances lobe_chances(Bsdf b, Float cos_o)
 {
     LobeChances c;
     c.diffuse = (Float)(1.0f);
     return c;
 }
 
-inline Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Float wi_side, Float *pdf)
+static inline Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Float wi_side, Float *pdf)
 {
     const Mask above = (wi.z > 0.0f) & (wi_side > 0.0f);
     *pdf = pick(above, wi.z * INV_PI, (Float)(0.0f));
     return scale(b.base_color, *pdf);
 }
 
-inline Float left_of_choice(LobeChances chances, Float u_lobe) { return u_lobe; }
+static inline Float left_of_choice(LobeChances chances, Float u_lobe) { return u_lobe; }
 #endif
 
 /// Cosine-weighted direction about z: Malley's method.
-inline Vec3 sample_cosine(Float u1, Float u2)
+static inline Vec3 sample_cosine(Float u1, Float u2)
 {
     const Float radius = sqrt(u1);
     Float c;
@@ -80,20 +80,20 @@ inline Vec3 sample_cosine(Float u1, Float u2)
 }
 
 #if !GLOSSY
-inline Vec3 sample_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Float u_lobe, Float u1, Float u2)
+static inline Vec3 sample_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Float u_lobe, Float u1, Float u2)
 {
     return sample_cosine(u1, u2);
 }
 #else
 
-inline Float fifth_power_of_one_minus(Float x)
+static inline Float fifth_power_of_one_minus(Float x)
 {
     const Float y = max(1.0f - x, 0.0f);
     const Float y2 = y * y;
     return y2 * y2 * y;
 }
 
-inline Float schlick(Float f0, Float f90, Float cosine)
+static inline Float schlick(Float f0, Float f90, Float cosine)
 {
     return f0 + (f90 - f0) * fifth_power_of_one_minus(cosine);
 }
@@ -101,7 +101,7 @@ inline Float schlick(Float f0, Float f90, Float cosine)
 #if TRANSMISSION
 /// Reflectance of a dielectric boundary for light that meets it at `cosine` > 0, with `eta` the index
 /// beyond over the index here; 1 under total reflection.
-inline Float fresnel_dielectric(Float cosine, Float eta)
+static inline Float fresnel_dielectric(Float cosine, Float eta)
 {
     const Float sin2 = (1.0f - cosine * cosine) / (eta * eta);
     const Mask total = sin2 >= 1.0f;
@@ -113,7 +113,7 @@ inline Float fresnel_dielectric(Float cosine, Float eta)
 #endif
 
 /// Sum of c[k] x^k.
-inline Float cubic(float c0, float c1, float c2, float c3, Float x)
+static inline Float cubic(float c0, float c1, float c2, float c3, Float x)
 {
     return c0 + x * (c1 + x * (c2 + x * c3));
 }
@@ -123,7 +123,7 @@ inline Float cubic(float c0, float c1, float c2, float c3, Float x)
 // added, for light must not be gained.
 
 /// Set up mirror_albedo for a roughness.
-inline void fit_mirror(Float alpha, Float *c)
+static inline void fit_mirror(Float alpha, Float *c)
 {
     c[0] = cubic(0.026616f, -0.0581f, -0.009742f, 0.060876f, alpha);
     c[1] = cubic(-0.348857f, 1.888125f, 3.694314f, -2.159958f, alpha);
@@ -133,7 +133,7 @@ inline void fit_mirror(Float alpha, Float *c)
 }
 
 /// Part of the light that a white GGX mirror reflects, without scattering between facets.
-inline Float mirror_albedo(const Float *c, Float s, Float cosine)
+static inline Float mirror_albedo(const Float *c, Float s, Float cosine)
 {
     const Float lost = (1.0f - s) * (c[0] + s * (c[1] + s * (c[2] + s * (c[3] + s * c[4]))));
     const Float safe = 0.0047f + 0.014f * max(1.0f - 50.0f * cosine, 0.0f);
@@ -141,7 +141,7 @@ inline Float mirror_albedo(const Float *c, Float s, Float cosine)
 }
 
 /// Set up edge_albedo for a roughness.
-inline void fit_edge(Float alpha, Float *c)
+static inline void fit_edge(Float alpha, Float *c)
 {
     const Float q = 1.0f / (1.0f + 8.0f * alpha);
     c[0] = cubic(-0.027605f, 0.549456f, 0.104114f, 0.389766f, q);
@@ -151,7 +151,7 @@ inline void fit_edge(Float alpha, Float *c)
 }
 
 /// Part of the light that GGX with a reflectance of (1 - cos)^5 reflects.
-inline Float edge_albedo(const Float *c, Float s, Float cosine)
+static inline Float edge_albedo(const Float *c, Float s, Float cosine)
 {
     const Float cos2 = cosine * cosine;
     const Float safe = 0.006f * (1.0f - cos2 * cos2) + 0.014f * max(1.0f - 50.0f * cosine, 0.0f);
@@ -159,7 +159,7 @@ inline Float edge_albedo(const Float *c, Float s, Float cosine)
 }
 
 /// Part of the light from one direction that the rough coat of `b` reflects into all directions.
-inline Float coat_albedo(Bsdf b, LobeChances c, Float cosine)
+static inline Float coat_albedo(Bsdf b, LobeChances c, Float cosine)
 {
     const Float s = cosine / (cosine + b.alpha);
     const Float mirror = b.f0 * mirror_albedo(c.to_mirror, s, cosine);
@@ -167,7 +167,7 @@ inline Float coat_albedo(Bsdf b, LobeChances c, Float cosine)
 }
 
 /// Cosine-weighted mean of coat_albedo over the hemisphere, to 5e-4.
-inline Float average_coat_albedo(Bsdf b)
+static inline Float average_coat_albedo(Bsdf b)
 {
     const Float r = sqrt(b.alpha);
     const Float q = 1.0f / (1.0f + 8.0f * b.alpha);
@@ -183,7 +183,7 @@ inline Float average_coat_albedo(Bsdf b)
 #define SHEEN_ROUGHNESS_MIN 0.3f
 
 /// Part of the light that the clear coat reflects.
-inline Float clear_coat_albedo(Float alpha, Float cosine)
+static inline Float clear_coat_albedo(Float alpha, Float cosine)
 {
     Float mirror[5];
     Float edge[4];
@@ -194,10 +194,10 @@ inline Float clear_coat_albedo(Float alpha, Float cosine)
 }
 
 /// What white sheen is scaled by, so that it nowhere reflects more than all: 1 from roughness 0.46 on.
-inline Float sheen_scale(Float roughness) { return 1.0f / max(2.2f - 2.6f * roughness, (Float)(1.0f)); }
+static inline Float sheen_scale(Float roughness) { return 1.0f / max(2.2f - 2.6f * roughness, (Float)(1.0f)); }
 
 /// Part of the light that white sheen reflects: a fit that errs by 0.02, which is added.
-inline Float sheen_albedo(Float r, Float cosine)
+static inline Float sheen_albedo(Float r, Float cosine)
 {
     const Float s = cosine / (cosine + 0.3f);
     const Float fit = cubic(3.085667f, -8.272625f, 9.952519f, -4.147989f, r)
@@ -208,7 +208,7 @@ inline Float sheen_albedo(Float r, Float cosine)
 }
 
 /// White sheen times cos i, without its scale.
-inline Float eval_sheen(Float roughness, Float cos_o, Float cos_i, Float cos_h)
+static inline Float eval_sheen(Float roughness, Float cos_o, Float cos_i, Float cos_h)
 {
     const Float inverse = 1.0f / (roughness * roughness);
     const Float sine2 = max(1.0f - cos_h * cos_h, (Float)(1e-12f));
@@ -218,7 +218,7 @@ inline Float eval_sheen(Float roughness, Float cos_o, Float cos_i, Float cos_h)
 #endif
 
 /// Reflectance of the dielectric part of `b`, where its opaque share reflects `opaque`.
-inline Float dielectric_reflectance(Bsdf b, Float opaque, Float cosine)
+static inline Float dielectric_reflectance(Bsdf b, Float opaque, Float cosine)
 {
 #if TRANSMISSION
     Float clear = fresnel_dielectric(max(cosine, 1e-6f), b.eta);
@@ -298,14 +298,14 @@ typedef struct {
     Float x;
     Float y;
 } Alphas;
-inline Alphas alphas_of(Bsdf b)
+static inline Alphas alphas_of(Bsdf b)
 {
     Alphas a;
     a.x = b.alpha;
     a.y = b.alpha_y;
     return a;
 }
-inline Alphas alphas_equal(Float alpha)
+static inline Alphas alphas_equal(Float alpha)
 {
     Alphas a;
     a.x = alpha;
@@ -317,7 +317,7 @@ inline Alphas alphas_equal(Float alpha)
 #define ALPHA_LEAST(a) min((a).x, (a).y)
 #else
 typedef Float Alphas;
-inline Alphas alphas_of(Bsdf b) { return b.alpha; }
+static inline Alphas alphas_of(Bsdf b) { return b.alpha; }
 #define ALPHA_X(a) (a)
 #define ALPHA_Y(a) (a)
 #define ALPHA_LEAST(a) (a)
@@ -325,7 +325,7 @@ inline Alphas alphas_of(Bsdf b) { return b.alpha; }
 
 /// GGX density of the microfacet normal `h` (local, unit).  From the slopes, because 1 - h.z^2 has
 /// cancelled away where the lobe is sharp.
-inline Float ggx_d(Vec3 h, Alphas alpha)
+static inline Float ggx_d(Vec3 h, Alphas alpha)
 {
 #if LAYERS
     const Float x = h.x / alpha.x;
@@ -340,7 +340,7 @@ inline Float ggx_d(Vec3 h, Alphas alpha)
 }
 
 /// Length of (alpha_x x, alpha_y y, z) for a unit vector.
-inline Float ggx_stretch(Vec3 w, Alphas alpha)
+static inline Float ggx_stretch(Vec3 w, Alphas alpha)
 {
 #if LAYERS
     const Float x = alpha.x * w.x;
@@ -352,14 +352,14 @@ inline Float ggx_stretch(Vec3 w, Alphas alpha)
 }
 
 /// Height-correlated masking and shadowing over 4 cos_o cos_i; wi.z > 0 is given apart.
-inline Float ggx_visibility(Vec3 wo, Vec3 wi, Float cos_i, Alphas alpha)
+static inline Float ggx_visibility(Vec3 wo, Vec3 wi, Float cos_i, Alphas alpha)
 {
     const Vec3 i = vec3(wi.x, wi.y, cos_i);
     return 0.5f / max(wo.z * ggx_stretch(i, alpha) + cos_i * ggx_stretch(wo, alpha), 1e-20f);
 }
 
 /// Share of the cap of visible normals that can reflect above the horizon (the k of Eto, Tokuyoshi).
-inline Float ggx_bound(Vec3 wo, Alphas alpha)
+static inline Float ggx_bound(Vec3 wo, Alphas alpha)
 {
     const Float s = 1.0f + sqrt(max(1.0f - wo.z * wo.z, 0.0f));
     const Float least = ALPHA_LEAST(alpha);
@@ -369,7 +369,7 @@ inline Float ggx_bound(Vec3 wo, Alphas alpha)
 }
 
 /// Draw a microfacet normal visible from wo; `bound` is ggx_bound for a reflection, 1 for all of them.
-inline Vec3 sample_ggx(Vec3 wo, Alphas alpha, Float bound, Float u1, Float u2)
+static inline Vec3 sample_ggx(Vec3 wo, Alphas alpha, Float bound, Float u1, Float u2)
 {
     const Vec3 stretched = normalize3(vec3(ALPHA_X(alpha) * wo.x, ALPHA_Y(alpha) * wo.y, wo.z));
     const Float lowest = bound * stretched.z;
@@ -383,13 +383,13 @@ inline Vec3 sample_ggx(Vec3 wo, Alphas alpha, Float bound, Float u1, Float u2)
 }
 
 /// Density of the direction that sample_ggx with ggx_bound reflects into.
-inline Float pdf_ggx_reflect(Vec3 wo, Vec3 h, Alphas alpha)
+static inline Float pdf_ggx_reflect(Vec3 wo, Vec3 h, Alphas alpha)
 {
     return ggx_d(h, alpha) / (2.0f * (ggx_bound(wo, alpha) * wo.z + ggx_stretch(wo, alpha)));
 }
 
 /// Factors of f cos of the diffuse base beside its colour and what lies over the coat: that of wo ...
-inline Float under_diffuse(Bsdf b, LobeChances chances, Float cos_o)
+static inline Float under_diffuse(Bsdf b, LobeChances chances, Float cos_o)
 {
     const Float stays = 1.0f - average_coat_albedo(b);
     Float under = (1.0f - b.metallic) * (1.0f - coat_albedo(b, chances, cos_o)) / max(stays, 1e-6f);
@@ -400,13 +400,13 @@ inline Float under_diffuse(Bsdf b, LobeChances chances, Float cos_o)
 }
 
 /// ... and that of the light.
-inline Float base_light(Bsdf b, LobeChances chances, Float cos_i)
+static inline Float base_light(Bsdf b, LobeChances chances, Float cos_i)
 {
     return (1.0f - coat_albedo(b, chances, cos_i)) * cos_i * INV_PI;
 }
 
 /// Factor of wo of the diffuse base, beside its colour, under all that lies over it.
-inline Float base_gate(Bsdf b, LobeChances chances, Float cos_o)
+static inline Float base_gate(Bsdf b, LobeChances chances, Float cos_o)
 {
     const Float under = under_diffuse(b, chances, cos_o);
 #if LAYERS
@@ -417,7 +417,7 @@ inline Float base_gate(Bsdf b, LobeChances chances, Float cos_o)
 }
 
 /// Share of `f`, which eval_bsdf gave for wo and wi, that the diffuse base has.
-inline Vec3 base_share(Bsdf b, LobeChances chances, Float gate, Vec3 wi, Vec3 f)
+static inline Vec3 base_share(Bsdf b, LobeChances chances, Float gate, Vec3 wi, Vec3 f)
 {
     const Float under = pick(wi.z > 0.0f, gate * base_light(b, chances, max(wi.z, 0.0f)), (Float)(0.0f));
     const Vec3 base = scale(b.base_color, under);
@@ -527,7 +527,7 @@ LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Flo
 }
 
 /// What is left of a number in [0, 1) that has chosen the lobe: uniform in [0, 1) again.
-inline Float left_of_choice(LobeChances chances, Float u_lobe)
+static inline Float left_of_choice(LobeChances chances, Float u_lobe)
 {
     // The lobes lie one after the other: diffuse, reflect, coat, refract.
     Float low = (Float)(0.0f);

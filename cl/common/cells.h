@@ -24,7 +24,7 @@ typedef struct {
 } CellKey;
 
 /// Side of the cube that a unit vector points to: axis and sign, 0 to 5.
-inline UInt cube_face(Vec3 n)
+static inline UInt cube_face(Vec3 n)
 {
     const Float ax = fabs(n.x);
     const Float ay = fabs(n.y);
@@ -38,7 +38,7 @@ inline UInt cube_face(Vec3 n)
 
 /// Level of a cell of about `width`: the power of two below, or with the chance of the rest the one
 /// above, so that no seam shows where levels change.
-inline UInt cell_level(Float width, Float dither)
+static inline UInt cell_level(Float width, Float dither)
 {
     const UInt bits = as_bits(clamp(width, (Float)(0x1p-60f), (Float)(0x1p60f)));
     const Float rest = from_bits((bits & 0x007fffffu) | 0x3f800000u) - 1.0f;
@@ -46,14 +46,14 @@ inline UInt cell_level(Float width, Float dither)
 }
 
 /// Edge of the cells of a level.
-inline Float cell_edge(UInt level) { return from_bits(level << 23); }
+static inline Float cell_edge(UInt level) { return from_bits(level << 23); }
 
 /// Return the cell of a point that is moved in its tangent plane by up to half a cell.
 ///
 /// The level is chosen again after the move, or there would be cells of levels that no point that
 /// stays has.  Walls lie on planes of round numbers: the grid is shifted off these.  Blocks of 2 x 2 x 2
 /// cells share a bucket, for neighbours are looked up together.
-inline CellKey cell_of(__global const Params *params, CellQuery q, UInt random_x, UInt random_y)
+static inline CellKey cell_of(__global const Params *params, CellQuery q, UInt random_x, UInt random_y)
 {
     const Float dither = unit_float(mix_bits(random_x ^ rotate(random_y, (UInt)(16u))));
     UInt level = cell_level(q.width, dither);
@@ -97,7 +97,7 @@ inline CellKey cell_of(__global const Params *params, CellQuery q, UInt random_x
 }
 
 /// Radiance behind a gate that let `beyond` through; 0 where next to nothing gets through.
-inline Vec3 demodulated(Vec3 beyond, Vec3 gate)
+static inline Vec3 demodulated(Vec3 beyond, Vec3 gate)
 {
     const Mask r = gate.x > 1e-30f;
     const Mask g = gate.y > 1e-30f;

@@ -21,7 +21,7 @@ typedef struct {
     Float z[FEW];
 } SeenCorners;
 
-inline void see_corners(
+static inline void see_corners(
     __global const Params *params, __global const float *corners, Vec3 origin, Vec3 direction, SeenCorners *seen)
 {
     const Vec3 n = normalize3(direction);
@@ -39,7 +39,7 @@ inline void see_corners(
 }
 
 /// a * d - b * c with the sign of the exact value (short of underflow); see geometry.h.
-inline Float signed_difference_lanes(Float a, Float d, Float b, Float c)
+static inline Float signed_difference_lanes(Float a, Float d, Float b, Float c)
 {
 #pragma OPENCL FP_CONTRACT OFF
     const Float product = b * c;
@@ -83,7 +83,7 @@ LARGE_FUNCTION Edges careful_edges(Float ax, Float ay, Float bx, Float by, Float
 #define FACE_RUN 32u
 
 /// Bit k is set where one of the rays may meet the plane of face `first` + k inside of its edges.
-inline uint met_faces(const SeenCorners *seen, __global const uint *faces, uint first, uint count, Mask active)
+static inline uint met_faces(const SeenCorners *seen, __global const uint *faces, uint first, uint count, Mask active)
 {
     uint bits = 0;
     for (uint k = 0; k < count; ++k) {
@@ -101,7 +101,7 @@ inline uint met_faces(const SeenCorners *seen, __global const uint *faces, uint 
     return bits;
 }
 
-inline Edges edges_of(const SeenCorners *seen, uint a, uint b, uint c, Mask active)
+static inline Edges edges_of(const SeenCorners *seen, uint a, uint b, uint c, Mask active)
 {
 #pragma OPENCL FP_CONTRACT OFF
     const Float ax = seen->x[a];
@@ -133,7 +133,7 @@ inline Edges edges_of(const SeenCorners *seen, uint a, uint b, uint c, Mask acti
 }
 
 /// First hits of the rays; of equally near triangles that of the lowest index.
-inline Hits trace_closest_few(
+static inline Hits trace_closest_few(
     __global const Params *params,
     Mask active,
     Vec3 origin,
@@ -182,7 +182,7 @@ inline Hits trace_closest_few(
 }
 
 /// Whether anything lies on the rays between their origins and `t` = 1.
-inline Mask trace_any_few(
+static inline Mask trace_any_few(
     __global const Params *params,
     Mask active,
     Vec3 origin,

@@ -15,10 +15,10 @@
 #define NO_SLOT 0xffffffffu
 
 /// Slots of a bucket in a table of `slots`, a power of two.
-inline uint bucket_size(uint slots) { return min(slots, BUCKET_SLOTS); }
+static inline uint bucket_size(uint slots) { return min(slots, BUCKET_SLOTS); }
 
 /// Mix all bits of `x` by another bijection than mix_bits.  Appleby: MurmurHash3, finalizer.
-inline UInt mix_bits_too(UInt x)
+static inline UInt mix_bits_too(UInt x)
 {
     x ^= x >> 16;
     x *= 0x85ebca6bu;
@@ -29,13 +29,13 @@ inline UInt mix_bits_too(UInt x)
 }
 
 /// Fingerprint of a hash: 0 means an empty slot.
-inline UInt fingerprint(UInt hash) { return max(hash, (UInt)(1u)); }
+static inline UInt fingerprint(UInt hash) { return max(hash, (UInt)(1u)); }
 
 /// First slot of the bucket that a hash names.
-inline UInt bucket_of(UInt hash, uint slots) { return hash & (slots - 1u) & ~(bucket_size(slots) - 1u); }
+static inline UInt bucket_of(UInt hash, uint slots) { return hash & (slots - 1u) & ~(bucket_size(slots) - 1u); }
 
 /// Slot of the key in its bucket, claimed if it was not there; NO_SLOT if the bucket is full.
-inline uint find_or_insert(volatile __global uint *keys, uint bucket, uint size, uint key)
+static inline uint find_or_insert(volatile __global uint *keys, uint bucket, uint size, uint key)
 {
     for (uint i = 0; i < size; ++i) {
         const uint slot = bucket + ((key + i) & (size - 1u));
@@ -49,7 +49,7 @@ inline uint find_or_insert(volatile __global uint *keys, uint bucket, uint size,
 }
 
 /// Slot of the key in its bucket, NO_SLOT if it is not there.
-inline uint find(const __global uint *keys, uint bucket, uint size, uint key)
+static inline uint find(const __global uint *keys, uint bucket, uint size, uint key)
 {
     for (uint i = 0; i < size; ++i) {
         const uint slot = bucket + ((key + i) & (size - 1u));
@@ -63,12 +63,12 @@ inline uint find(const __global uint *keys, uint bucket, uint size, uint key)
 }
 
 /// Slots that were looked at before the one that a key took.
-inline uint probes_before(uint slot, uint size, uint key) { return (slot - key) & (size - 1u); }
+static inline uint probes_before(uint slot, uint size, uint key) { return (slot - key) & (size - 1u); }
 
 /// Steps of `value` (from 0 on, finite, below 2^63 / steps), rounded up with the chance of the fraction.
 ///
 /// `u` in [0, 1).  From 2^24 steps on a float is a whole number of them.
-inline void to_fixed(Float value, Float steps, Float u, UInt *low, UInt *high)
+static inline void to_fixed(Float value, Float steps, Float u, UInt *low, UInt *high)
 {
     const Float x = value * steps;
     const Float rounded = pick(x < 0x1p23f, floor(x + u), x);
@@ -78,10 +78,10 @@ inline void to_fixed(Float value, Float steps, Float u, UInt *low, UInt *high)
 }
 
 /// Value of a sum, in steps.
-inline Float from_fixed(UInt low, UInt high) { return to_float(high) * 0x1p32f + to_float(low); }
+static inline Float from_fixed(UInt low, UInt high) { return to_float(high) * 0x1p32f + to_float(low); }
 
 /// Add to a 64-bit sum: a carry out of the low word belongs to whoever caused it.
-inline void add_fixed(volatile __global uint *low, volatile __global uint *high, uint more_low, uint more_high)
+static inline void add_fixed(volatile __global uint *low, volatile __global uint *high, uint more_low, uint more_high)
 {
     uint carry = more_high;
     if (more_low != 0u)
@@ -91,7 +91,7 @@ inline void add_fixed(volatile __global uint *low, volatile __global uint *high,
 }
 
 /// Add samples, `count` of them, whose radiance sums up to the fixed-point numbers given, to a cell.
-inline void add_to_cell(volatile __global Cell *cell, const ulong *sum, uint count)
+static inline void add_to_cell(volatile __global Cell *cell, const ulong *sum, uint count)
 {
     for (uint c = 0; c < 3; ++c)
         add_fixed(&cell->low[c], &cell->high[c], (uint)sum[c], (uint)(sum[c] >> 32));
@@ -99,7 +99,7 @@ inline void add_to_cell(volatile __global Cell *cell, const ulong *sum, uint cou
 }
 
 /// Add the samples of the lanes in `mask` to the cells at `slot`: one addition for all of a cell.
-inline void add_lanes(volatile __global Cell *cells, Mask mask, UInt slot, const UInt *low, const UInt *high)
+static inline void add_lanes(volatile __global Cell *cells, Mask mask, UInt slot, const UInt *low, const UInt *high)
 {
     uint lane_slot[W];
     uint lane_low[3][W];

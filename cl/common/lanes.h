@@ -36,7 +36,7 @@ typedef JOIN(int, W) Mask;
 // A large function: on a CPU it stays apart, for compilers take longer over one large kernel than over
 // its parts (measured on shade_paths: half the time, no difference in speed).
 #if W == 1
-#define LARGE_FUNCTION inline
+#define LARGE_FUNCTION static inline
 #else
 #define LARGE_FUNCTION static __attribute__((noinline))
 #endif
@@ -47,41 +47,41 @@ typedef JOIN(int, W) Mask;
 // GATHER(array, index, member): array[index].member of every lane, GATHER_U the same for uint;
 // GATHER_WORD(array, index): array[index] of uints; gather_words(array, index): of floats.
 #if W == 1
-inline float pick(int mask, float then, float otherwise) { return mask ? then : otherwise; }
-inline uint pick_u(int mask, uint then, uint otherwise) { return mask ? then : otherwise; }
-inline int any_lane(int mask) { return mask != 0; }
-inline uint count_lanes(int mask) { return mask != 0; }
-inline uint lanes_before(int mask) { return 0; }
-inline uint lane_bits(int mask) { return mask != 0; }
-inline int lanes_of(uint bits) { return bits & 1u; }
-inline float least_lane(float x) { return x; }
-inline float to_float(uint x) { return (float)x; }
-inline uint to_uint(float x) { return (uint)x; }
-inline uint as_bits(float x) { return as_uint(x); }
-inline float from_bits(uint x) { return as_float(x); }
-inline void store_lanes(float x, float *array) { array[0] = x; }
-inline void store_lanes_u(uint x, uint *array) { array[0] = x; }
-inline float load_lanes(const float *array) { return array[0]; }
-inline uint load_lanes_u(const uint *array) { return array[0]; }
+static inline float pick(int mask, float then, float otherwise) { return mask ? then : otherwise; }
+static inline uint pick_u(int mask, uint then, uint otherwise) { return mask ? then : otherwise; }
+static inline int any_lane(int mask) { return mask != 0; }
+static inline uint count_lanes(int mask) { return mask != 0; }
+static inline uint lanes_before(int mask) { return 0; }
+static inline uint lane_bits(int mask) { return mask != 0; }
+static inline int lanes_of(uint bits) { return bits & 1u; }
+static inline float least_lane(float x) { return x; }
+static inline float to_float(uint x) { return (float)x; }
+static inline uint to_uint(float x) { return (uint)x; }
+static inline uint as_bits(float x) { return as_uint(x); }
+static inline float from_bits(uint x) { return as_float(x); }
+static inline void store_lanes(float x, float *array) { array[0] = x; }
+static inline void store_lanes_u(uint x, uint *array) { array[0] = x; }
+static inline float load_lanes(const float *array) { return array[0]; }
+static inline uint load_lanes_u(const uint *array) { return array[0]; }
 #define GATHER(array, index, member) ((array)[index].member)
 #define GATHER_U(array, index, member) ((array)[index].member)
 #define GATHER_WORD(array, index) ((array)[index])
-inline float gather_words(__global const float *words, uint at) { return words[at]; }
+static inline float gather_words(__global const float *words, uint at) { return words[at]; }
 #else
-inline Float pick(Mask mask, Float then, Float otherwise) { return select(otherwise, then, mask); }
-inline UInt pick_u(Mask mask, UInt then, UInt otherwise) { return select(otherwise, then, mask); }
-inline int any_lane(Mask mask) { return ANY(mask); }
-inline Float to_float(UInt x) { return JOIN(convert_float, W)(x); }
-inline UInt to_uint(Float x) { return JOIN(convert_uint, W)(x); }
-inline UInt as_bits(Float x) { return JOIN(as_uint, W)(x); }
-inline UInt as_lanes_u(Mask x) { return JOIN(as_uint, W)(x); }
-inline Float from_bits(UInt x) { return JOIN(as_float, W)(x); }
-inline void store_lanes(Float x, float *array) { JOIN(vstore, W)(x, 0, array); }
-inline void store_lanes_u(UInt x, uint *array) { JOIN(vstore, W)(x, 0, array); }
-inline Float load_lanes(const float *array) { return JOIN(vload, W)(0, array); }
-inline UInt load_lanes_u(const uint *array) { return JOIN(vload, W)(0, array); }
+static inline Float pick(Mask mask, Float then, Float otherwise) { return select(otherwise, then, mask); }
+static inline UInt pick_u(Mask mask, UInt then, UInt otherwise) { return select(otherwise, then, mask); }
+static inline int any_lane(Mask mask) { return ANY(mask); }
+static inline Float to_float(UInt x) { return JOIN(convert_float, W)(x); }
+static inline UInt to_uint(Float x) { return JOIN(convert_uint, W)(x); }
+static inline UInt as_bits(Float x) { return JOIN(as_uint, W)(x); }
+static inline UInt as_lanes_u(Mask x) { return JOIN(as_uint, W)(x); }
+static inline Float from_bits(UInt x) { return JOIN(as_float, W)(x); }
+static inline void store_lanes(Float x, float *array) { JOIN(vstore, W)(x, 0, array); }
+static inline void store_lanes_u(UInt x, uint *array) { JOIN(vstore, W)(x, 0, array); }
+static inline Float load_lanes(const float *array) { return JOIN(vload, W)(0, array); }
+static inline UInt load_lanes_u(const uint *array) { return JOIN(vload, W)(0, array); }
 #if W == 8
-inline uint count_lanes(Mask mask)
+static inline uint count_lanes(Mask mask)
 {
     const int4 a = mask.lo + mask.hi;
     const int2 b = a.lo + a.hi;
@@ -91,7 +91,7 @@ inline uint count_lanes(Mask mask)
     ((type)((words)[(at).s0], (words)[(at).s1], (words)[(at).s2], (words)[(at).s3],                \
             (words)[(at).s4], (words)[(at).s5], (words)[(at).s6], (words)[(at).s7]))
 #else
-inline uint count_lanes(Mask mask)
+static inline uint count_lanes(Mask mask)
 {
     const int8 a = mask.lo + mask.hi;
     const int4 b = a.lo + a.hi;
@@ -117,7 +117,7 @@ inline uint count_lanes(Mask mask)
 #define LANE_BITS                                                                                  \
     ((Int)(1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192, 16384, 32768))
 #endif
-inline UInt lanes_before(Mask mask)
+static inline UInt lanes_before(Mask mask)
 {
     UInt sum = as_lanes_u(mask) & 1u;
     sum = SHIFT_1(sum);
@@ -129,7 +129,7 @@ inline UInt lanes_before(Mask mask)
 #endif
     return sum;
 }
-inline uint lane_bits(Mask mask)
+static inline uint lane_bits(Mask mask)
 {
 #if W == 16 && defined(__AVX512DQ__)
     return (ushort)__builtin_ia32_cvtd2mask512(mask);
@@ -144,8 +144,8 @@ inline uint lane_bits(Mask mask)
     return bits;
 #endif
 }
-inline Mask lanes_of(uint bits) { return ((Int)((int)bits) & LANE_BITS) != 0; }
-inline float least_lane(Float x)
+static inline Mask lanes_of(uint bits) { return ((Int)((int)bits) & LANE_BITS) != 0; }
+static inline float least_lane(Float x)
 {
 #if W == 16
     const JOIN(float, 8) a = min(x.lo, x.hi);
@@ -159,12 +159,12 @@ inline float least_lane(Float x)
 #define WORDS_OF(array) ((uint)(sizeof(*(array)) / 4))
 #if W == 16 && defined(__AVX512F__)
 // The processor's own gather: compilers do not find it, and shade_paths takes 1.3 times as long without.
-inline Float gather_words(__global const float *words, UInt at)
+static inline Float gather_words(__global const float *words, UInt at)
 {
     return __builtin_ia32_gathersiv16sf((Float)(0.0f), (const void *)(ulong)words, as_int16(at), (ushort)0xffff, 4);
 }
 #else
-inline Float gather_words(__global const float *words, UInt at) { return GATHER_(Float, words, at); }
+static inline Float gather_words(__global const float *words, UInt at) { return GATHER_(Float, words, at); }
 #endif
 #define GATHER(array, index, member)                                                               \
     gather_words((__global const float *)&(array)->member, (index)*WORDS_OF(array))
@@ -173,7 +173,7 @@ inline Float gather_words(__global const float *words, UInt at) { return GATHER_
 #endif
 
 /// Index of the lowest set bit; `bits` is not 0.
-inline uint lowest_bit(uint bits) { return popcount((bits - 1u) & ~bits); }
+static inline uint lowest_bit(uint bits) { return popcount((bits - 1u) & ~bits); }
 
 #define MASK_ALL ((Mask)(-1))
 
@@ -187,7 +187,7 @@ typedef struct {
     Float z;
 } Vec3;
 
-inline Vec3 vec3(Float x, Float y, Float z)
+static inline Vec3 vec3(Float x, Float y, Float z)
 {
     Vec3 v;
     v.x = x;
@@ -195,25 +195,25 @@ inline Vec3 vec3(Float x, Float y, Float z)
     v.z = z;
     return v;
 }
-inline Vec3 vec3_of(const __global float *p) { return vec3((Float)(p[0]), (Float)(p[1]), (Float)(p[2])); }
-inline Vec3 vec3_all(Float x) { return vec3(x, x, x); }
-inline Vec3 add(Vec3 a, Vec3 b) { return vec3(a.x + b.x, a.y + b.y, a.z + b.z); }
-inline Vec3 sub(Vec3 a, Vec3 b) { return vec3(a.x - b.x, a.y - b.y, a.z - b.z); }
-inline Vec3 mul(Vec3 a, Vec3 b) { return vec3(a.x * b.x, a.y * b.y, a.z * b.z); }
-inline Vec3 scale(Vec3 a, Float s) { return vec3(a.x * s, a.y * s, a.z * s); }
-inline Vec3 add_scaled(Vec3 a, Vec3 b, Float s) { return vec3(a.x + b.x * s, a.y + b.y * s, a.z + b.z * s); }
-inline Float dot3(Vec3 a, Vec3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-inline Vec3 cross3(Vec3 a, Vec3 b)
+static inline Vec3 vec3_of(const __global float *p) { return vec3((Float)(p[0]), (Float)(p[1]), (Float)(p[2])); }
+static inline Vec3 vec3_all(Float x) { return vec3(x, x, x); }
+static inline Vec3 add(Vec3 a, Vec3 b) { return vec3(a.x + b.x, a.y + b.y, a.z + b.z); }
+static inline Vec3 sub(Vec3 a, Vec3 b) { return vec3(a.x - b.x, a.y - b.y, a.z - b.z); }
+static inline Vec3 mul(Vec3 a, Vec3 b) { return vec3(a.x * b.x, a.y * b.y, a.z * b.z); }
+static inline Vec3 scale(Vec3 a, Float s) { return vec3(a.x * s, a.y * s, a.z * s); }
+static inline Vec3 add_scaled(Vec3 a, Vec3 b, Float s) { return vec3(a.x + b.x * s, a.y + b.y * s, a.z + b.z * s); }
+static inline Float dot3(Vec3 a, Vec3 b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+static inline Vec3 cross3(Vec3 a, Vec3 b)
 {
     return vec3(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x);
 }
-inline Vec3 pick_v(Mask mask, Vec3 then, Vec3 otherwise)
+static inline Vec3 pick_v(Mask mask, Vec3 then, Vec3 otherwise)
 {
     return vec3(pick(mask, then.x, otherwise.x), pick(mask, then.y, otherwise.y),
                 pick(mask, then.z, otherwise.z));
 }
-inline Vec3 lerp3(Vec3 a, Vec3 b, Float t) { return add_scaled(a, sub(b, a), t); }
-inline Float max3(Vec3 a) { return max(a.x, max(a.y, a.z)); }
+static inline Vec3 lerp3(Vec3 a, Vec3 b, Float t) { return add_scaled(a, sub(b, a), t); }
+static inline Float max3(Vec3 a) { return max(a.x, max(a.y, a.z)); }
 
 /// normalize3 where the square of the length leaves the range of float.
 LARGE_FUNCTION Vec3 normalize3_scaled(Vec3 v)
@@ -226,7 +226,7 @@ LARGE_FUNCTION Vec3 normalize3_scaled(Vec3 v)
 }
 
 /// Unit vector along `v`; (0, 0, 1) where `v` has no direction, or is too small for its reciprocal.
-inline Vec3 normalize3(Vec3 v)
+static inline Vec3 normalize3(Vec3 v)
 {
     const Float length2 = dot3(v, v);
     const Mask ok = (length2 > 0x1p-100f) & (length2 < 0x1p100f);
@@ -237,12 +237,12 @@ inline Vec3 normalize3(Vec3 v)
 }
 
 /// Unit vector along `v` whose length is 1 but for rounding: a step of Newton's method.
-inline Vec3 renormalize3(Vec3 v) { return scale(v, 1.5f - 0.5f * dot3(v, v)); }
+static inline Vec3 renormalize3(Vec3 v) { return scale(v, 1.5f - 0.5f * dot3(v, v)); }
 
 /// Two unit vectors that make a right-handed frame with the unit vector `n`.
 ///
 /// Duff et al.: Building an Orthonormal Basis, Revisited, JCGT 6 (1), 2017.
-inline void make_frame(Vec3 n, Vec3 *s, Vec3 *t)
+static inline void make_frame(Vec3 n, Vec3 *s, Vec3 *t)
 {
     const Float sign = pick(n.z >= 0.0f, (Float)(1.0f), (Float)(-1.0f));
     const Float a = -1.0f / (sign + n.z);
@@ -253,7 +253,7 @@ inline void make_frame(Vec3 n, Vec3 *s, Vec3 *t)
 
 /// Cosine and sine of 2 pi `turns`, for `turns` in [0, 1]; Taylor series on an eighth of a turn
 /// (error below 1e-7).  Library calls are scalar on PoCL: 30 ns each.
-inline void cos_sin_turns(Float turns, Float *cosine, Float *sine)
+static inline void cos_sin_turns(Float turns, Float *cosine, Float *sine)
 {
     const Float quarter = floor(turns * 4.0f + 0.5f);
     const Float x = (turns * 4.0f - quarter) * 1.57079632679490f;
@@ -276,7 +276,7 @@ inline void cos_sin_turns(Float turns, Float *cosine, Float *sine)
 /// Angle of (x, y) from the positive x axis in (-pi, pi]; 0 for (0, 0).
 ///
 /// Two half-angle steps bring the ratio below 0.2, where the series to x^9 is exact to float.
-inline Float atan2_lanes(Float y, Float x)
+static inline Float atan2_lanes(Float y, Float x)
 {
     const Float ax = fabs(x);
     const Float ay = fabs(y);

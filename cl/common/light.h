@@ -19,13 +19,13 @@ typedef struct {
 /// Slot of an alias table for 32 random bits; what is left of them is uniform in the slot.
 ///
 /// Vose: A Linear Algorithm for Generating Random Numbers with a Given Distribution, 1991.
-inline UInt alias_slot(UInt bits, uint count, Float *left)
+static inline UInt alias_slot(UInt bits, uint count, Float *left)
 {
     *left = unit_float(bits * count);
     return mul_hi(bits, (UInt)(count));
 }
 
-inline Float power_heuristic(Float a, Float b)
+static inline Float power_heuristic(Float a, Float b)
 {
     // Divided by the larger first: densities of tiny lights overflow when they are squared.
     const Float largest = max(max(a, b), 1e-30f);
@@ -36,7 +36,7 @@ inline Float power_heuristic(Float a, Float b)
 
 #if ENVIRONMENT == 2
 /// Texture coordinates of a world direction, and the sine of its angle from the zenith.
-inline void environment_uv(__global const Params *params, Vec3 d, Float *u, Float *v, Float *sine)
+static inline void environment_uv(__global const Params *params, Vec3 d, Float *u, Float *v, Float *sine)
 {
     __global const float *m = params->environment_rotation;
     const Vec3 l = vec3(m[0] * d.x + m[1] * d.y + m[2] * d.z, m[3] * d.x + m[4] * d.y + m[5] * d.z,
@@ -48,7 +48,7 @@ inline void environment_uv(__global const Params *params, Vec3 d, Float *u, Floa
 }
 
 /// Index of a cell; columns wrap, rows end.
-inline UInt environment_cell(__global const Params *params, Float x, Float y)
+static inline UInt environment_cell(__global const Params *params, Float x, Float y)
 {
     const Float width = (Float)((float)params->environment_width);
     const Float height = (Float)((float)params->environment_height);
@@ -59,7 +59,7 @@ inline UInt environment_cell(__global const Params *params, Float x, Float y)
 }
 
 /// Chance per solid angle of the cell at (u, v).
-inline Float environment_density(
+static inline Float environment_density(
     __global const Params *params, __global const EnvironmentCell *cells, UInt cell, Float sine)
 {
     const float count = (float)params->environment_width * (float)params->environment_height;
@@ -118,7 +118,7 @@ LARGE_FUNCTION Vec3 eval_environment(
 
 #if AREA_LIGHTS
 /// Density per solid angle with which sample_light draws a point at distance `t` on an emitter.
-inline Float area_light_density(__global const Light *lights, UInt light, Float t, Float cosine)
+static inline Float area_light_density(__global const Light *lights, UInt light, Float t, Float cosine)
 {
     const Float area = GATHER(lights, light, area);
     const Float pdf = GATHER(lights, light, pmf) * t * t / max(cosine * area, 1e-30f);

@@ -17,7 +17,7 @@
 
 #if AREA_LIGHTS
 /// Radiance that the lanes of `mask` give away, on either side.
-inline Vec3 fetch_emission(
+static inline Vec3 fetch_emission(
     Mask mask, SurfacePoint s, Float u, Float v, __global const Material *materials TEXTURE_PARAMETERS COLOR_PARAMETERS)
 {
     Vec3 emission = GATHER_COLOR(materials, s.material, emission);
@@ -38,7 +38,7 @@ inline Vec3 fetch_emission(
 /// `ns` turned so far that the mirrored direction of `wo` does not go below the real surface.
 ///
 /// Otherwise steep parts of a normal map would be black.
-inline Vec3 with_visible_mirror(Vec3 ns, Vec3 ng, Vec3 wo)
+static inline Vec3 with_visible_mirror(Vec3 ns, Vec3 ng, Vec3 wo)
 {
     const Vec3 mirrored = add_scaled(scale(wo, (Float)(-1.0f)), ns, 2.0f * dot3(ns, wo));
     const Float least = min(0.9f * dot3(ng, wo), (Float)(0.01f));
@@ -188,7 +188,7 @@ LARGE_FUNCTION Bsdf fetch_bsdf(
 
 #if TRANSMISSION
 /// e^x for x <= 0, to 1e-6: library calls are scalar on PoCL.
-inline Float exp_of_negative(Float x)
+static inline Float exp_of_negative(Float x)
 {
     const Float y = max(x * 1.44269504f, (Float)(-125.0f));
     const Float whole = floor(y);
@@ -200,7 +200,7 @@ inline Float exp_of_negative(Float x)
 }
 
 /// What is left of light after `t` meters, where `s` was met from inside; Beer's law.
-inline Vec3 attenuation(Mask hit, SurfacePoint s, Float t, __global const Material *materials)
+static inline Vec3 attenuation(Mask hit, SurfacePoint s, Float t, __global const Material *materials)
 {
     const Mask thin = (GATHER_U(materials, s.material, flags) & MATERIAL_THIN) != 0u;
     const Mask inside = hit & !s.front & !thin & (GATHER(materials, s.material, transmission) > 0.0f);

@@ -4,7 +4,7 @@
 #include "layout.h"
 
 /// Whether the counters say that pass `film_pass + k` is complete and wanted.
-inline int pass_is_complete(__global const Params *params, const volatile __global uint *counters, uint k)
+static inline int pass_is_complete(__global const Params *params, const volatile __global uint *counters, uint k)
 {
     const uint pass = counters[COUNTER_FILM_PASS] + k;
     return k < params->ring && pass < counters[COUNTER_PASS_LIMIT]
@@ -12,7 +12,7 @@ inline int pass_is_complete(__global const Params *params, const volatile __glob
 }
 
 /// Passes that are complete and wanted, from film_pass on.
-inline uint complete_passes(__global const Params *params, const volatile __global uint *counters)
+static inline uint complete_passes(__global const Params *params, const volatile __global uint *counters)
 {
     uint done = 0;
     while (pass_is_complete(params, counters, done)) // at most params->ring

@@ -5,7 +5,7 @@
 #include "layout.h"
 
 /// x / d for all lanes: the processor divides no vectors of integers.
-inline UInt divide(UInt x, uint d)
+static inline UInt divide(UInt x, uint d)
 {
     // The reciprocal is at most 1 too small, so the quotient is.
     const UInt q = mul_hi(x, (UInt)(0xffffffffu / d));
@@ -13,7 +13,7 @@ inline UInt divide(UInt x, uint d)
 }
 
 /// Column and row on the film of entry `i` of the queue's order (tables.pixel_order).
-inline void pixel_place(__global const Params *params, UInt i, UInt *x, UInt *y)
+static inline void pixel_place(__global const Params *params, UInt i, UInt *x, UInt *y)
 {
     const uint strip_pixels = STRIP_ROWS * params->crop_width;
     const UInt strip = divide(i, strip_pixels);

@@ -7,7 +7,7 @@
 #define ITEMS_PER_BLOCK (BLOCK / W)
 
 /// Address of the first field of the W paths of work item `item`.
-inline __global Float *pool_at(__global float *pool, uint item)
+static inline __global Float *pool_at(__global float *pool, uint item)
 {
     return (__global Float *)pool + (item / ITEMS_PER_BLOCK) * (PATH_FIELD_COUNT * ITEMS_PER_BLOCK)
            + item % ITEMS_PER_BLOCK;
@@ -16,13 +16,13 @@ inline __global Float *pool_at(__global float *pool, uint item)
 // One field of these paths: readable and writable.
 #define FIELD(path, field) (path)[(field) * ITEMS_PER_BLOCK]
 
-inline UInt get_u(__global Float *path, uint field) { return as_bits(FIELD(path, field)); }
-inline void put_u(__global Float *path, uint field, UInt value) { FIELD(path, field) = from_bits(value); }
-inline Vec3 get_v(__global Float *path, uint field)
+static inline UInt get_u(__global Float *path, uint field) { return as_bits(FIELD(path, field)); }
+static inline void put_u(__global Float *path, uint field, UInt value) { FIELD(path, field) = from_bits(value); }
+static inline Vec3 get_v(__global Float *path, uint field)
 {
     return vec3(FIELD(path, field), FIELD(path, field + 1), FIELD(path, field + 2));
 }
-inline void put_v(__global Float *path, uint field, Vec3 value)
+static inline void put_v(__global Float *path, uint field, Vec3 value)
 {
     FIELD(path, field) = value.x;
     FIELD(path, field + 1) = value.y;

@@ -19,7 +19,7 @@
 #define PAIR_ENVIRONMENT 3u // which texel; which side of its alias slot
 
 /// Mix all bits of `x`; a bijection.  Wellons, hash-prospector: "lowbias32".
-inline UInt mix_bits(UInt x)
+static inline UInt mix_bits(UInt x)
 {
     x ^= x >> 16;
     x *= 0x7feb352du;
@@ -29,7 +29,7 @@ inline UInt mix_bits(UInt x)
     return x;
 }
 
-inline UInt reverse_bits(UInt x)
+static inline UInt reverse_bits(UInt x)
 {
     x = (x >> 16) | (x << 16);
     x = ((x & 0xff00ff00u) >> 8) | ((x & 0x00ff00ffu) << 8);
@@ -44,7 +44,7 @@ inline UInt reverse_bits(UInt x)
 ///
 /// Laine, Karras: Stratified Sampling for Stochastic Transparency, 2011; Burley: Practical Hash-Based
 /// Owen Scrambling, JCGT 9 (4), 2020; constants by Vegdahl, "Building a Better LK Hash", 2021.
-inline UInt scramble_reversed(UInt x, UInt seed)
+static inline UInt scramble_reversed(UInt x, UInt seed)
 {
     x ^= x * 0x3d20adeau;
     x += seed;
@@ -56,7 +56,7 @@ inline UInt scramble_reversed(UInt x, UInt seed)
 
 /// Second Sobol' dimension of `index`, most significant digit in bit 0: digit k is the sum modulo 2 of
 /// the index digits j with C(j, k) odd.  By Lucas' theorem the matrix is a tensor power, hence five steps.
-inline UInt sobol_reversed(UInt index)
+static inline UInt sobol_reversed(UInt index)
 {
     index ^= (index & 0xaaaaaaaau) >> 1;
     index ^= (index & 0xccccccccu) >> 2;
@@ -67,10 +67,10 @@ inline UInt sobol_reversed(UInt index)
 }
 
 /// Top 24 bits as a number in [0, 1).
-inline Float unit_float(UInt x) { return to_float(x >> 8) * 5.9604645e-8f; }
+static inline Float unit_float(UInt x) { return to_float(x >> 8) * 5.9604645e-8f; }
 
 /// What tells pixels apart; `pixel` counts over the whole film, so a crop has the same numbers.
-inline UInt pixel_seed(UInt pixel, uint seed) { return mix_bits(pixel ^ mix_bits((UInt)(seed ^ 0x9e3779b9u))); }
+static inline UInt pixel_seed(UInt pixel, uint seed) { return mix_bits(pixel ^ mix_bits((UInt)(seed ^ 0x9e3779b9u))); }
 
 /// Two uniform 32-bit numbers, stratified over the samples of a pixel if the sampler is Sobol'.
 ///
@@ -93,7 +93,7 @@ LARGE_FUNCTION void sample_bits(
 }
 
 /// Two uniform numbers in [0, 1).
-inline void sample_pair(UInt seed, UInt reversed_index, UInt pair, uint sampler, Float *first, Float *second)
+static inline void sample_pair(UInt seed, UInt reversed_index, UInt pair, uint sampler, Float *first, Float *second)
 {
     UInt a;
     UInt b;

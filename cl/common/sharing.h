@@ -8,20 +8,20 @@
 
 #if CELLS
 /// Whether light that arrives at the vertex of `depth`, which found it itself, is shared.
-inline Mask shares_emission(__global const Params *params, UInt vertex, UInt depth)
+static inline Mask shares_emission(__global const Params *params, UInt vertex, UInt depth)
 {
     return (vertex != 0u) & (depth + params->filter_direct > vertex);
 }
 
 /// Whether light of a shadow ray from the vertex of `depth` is shared.
-inline Mask shares_connection(__global const Params *params, UInt vertex, UInt depth)
+static inline Mask shares_connection(__global const Params *params, UInt vertex, UInt depth)
 {
     return (vertex != 0u) & (depth + params->filter_direct >= vertex);
 }
 
 /// Add radiance to what a path gathered: `share` of the lanes of `shared` to what came from beyond its
 /// vertex.
-inline void gather_light(__global Float *path, Mask shared, Vec3 share, Vec3 radiance)
+static inline void gather_light(__global Float *path, Mask shared, Vec3 share, Vec3 radiance)
 {
     const Vec3 part = pick_v(shared, mul(share, radiance), vec3_all((Float)(0.0f)));
     put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), sub(radiance, part)));
@@ -32,7 +32,7 @@ inline void gather_light(__global Float *path, Mask shared, Vec3 share, Vec3 rad
 ///
 /// `spread` is the density of the direction that led here: a wide lobe has a low one.  A lobe's share
 /// of the surface is about distance^2 / density.
-inline Mask wants_cell(__global const Params *params, UInt depth, Float length, Float distance, Float spread)
+static inline Mask wants_cell(__global const Params *params, UInt depth, Float length, Float distance, Float spread)
 {
     if (params->filter_vertex != FILTER_AUTO)
         return depth + 1u >= params->filter_vertex;
@@ -44,7 +44,7 @@ inline Mask wants_cell(__global const Params *params, UInt depth, Float length, 
 ///
 /// In corners and slits the light changes within a cell; samples of near and of far light have cells of
 /// their own, so that each place gets both in the parts in which it sees them.
-inline UInt near_bit(
+static inline UInt near_bit(
     __global const Params *params, Mask hit, UInt vertex, UInt depth, Float length, Float distance)
 {
     const Mask next = hit & (vertex != 0u) & (depth == vertex);
@@ -52,7 +52,7 @@ inline UInt near_bit(
 }
 
 /// Hand in the vertices of the lanes in `chosen`.
-inline void store_cell_vertices(
+static inline void store_cell_vertices(
     __global const Params *params,
     __global CellVertex *vertices,
     Mask chosen,

@@ -94,7 +94,7 @@ LARGE_FUNCTION SurfacePoint surface_point(
 }
 
 /// Origin for a ray that leaves `s` along `wi`: off the surface, on the side that wi is on.
-inline Vec3 ray_origin(SurfacePoint s, Vec3 wi)
+static inline Vec3 ray_origin(SurfacePoint s, Vec3 wi)
 {
     const Float side = pick(dot3(s.ng, wi) >= 0.0f, s.offset, -s.offset);
     return add_scaled(s.p, s.ng, side);

@@ -25,7 +25,7 @@
 #endif
 
 /// Texel index along one axis, wrapped into [0, size).
-inline uint wrap_texel(int i, int size, int clamped, int mirrored)
+static inline uint wrap_texel(int i, int size, int clamped, int mirrored)
 {
     if (clamped)
         return (uint)clamp(i, 0, size - 1);
@@ -38,7 +38,7 @@ inline uint wrap_texel(int i, int size, int clamped, int mirrored)
 /// Colour (linear, RGB) and alpha of texture `index` at (u, v).
 ///
 /// A coordinate that is not finite, or too large for its texel to be told, reads texel 0.
-inline float4 look_up_texture(
+static inline float4 look_up_texture(
     __global const TextureInfo *textures,
     __global const uchar4 *texels,
     __global const float *srgb_to_linear,
@@ -85,7 +85,7 @@ inline float4 look_up_texture(
 }
 
 /// The two texels beside coordinate `x` along one axis, and the second one's weight, for all lanes.
-inline Float wrap_texels(
+static inline Float wrap_texels(
     Float x, Float size, Mask clamped, Mask mirrored, Mask nearest, UInt *first, UInt *second)
 {
     x = x * size - pick(nearest, (Float)(0.0f), (Float)(0.5f));
@@ -108,7 +108,7 @@ inline Float wrap_texels(
 }
 
 /// Add a texel of all lanes to a colour and its alpha.
-inline void add_texel(
+static inline void add_texel(
     UInt at,
     Float weight,
     Mask srgb,
@@ -165,7 +165,7 @@ LARGE_FUNCTION Vec3 look_up_textures(
 }
 
 /// Colour and alpha of texture `index` at a point of a triangle.
-inline float4 look_up_on_triangle(
+static inline float4 look_up_on_triangle(
     __global const Uvs *uvs,
     __global const TextureInfo *textures,
     __global const uchar4 *texels,
@@ -218,7 +218,7 @@ LARGE_FUNCTION Vec3 look_up_lanes(
 }
 
 /// Multiply `color` by a texture in the lanes of `mask`; `texture` may be NO_TEXTURE.
-inline Vec3 textured(
+static inline Vec3 textured(
     Mask mask,
     Vec3 color,
     UInt texture,
@@ -236,7 +236,7 @@ inline Vec3 textured(
 
 #if VERTEX_COLORS
 /// Colour at a point of a triangle.
-inline Vec3 corner_color(UInt triangle, Float u, Float v, __global const VertexColors *colors)
+static inline Vec3 corner_color(UInt triangle, Float u, Float v, __global const VertexColors *colors)
 {
     const Float w = 1.0f - u - v;
     return vec3(w * GATHER(colors, triangle, c0[0]) + u * GATHER(colors, triangle, c1[0])

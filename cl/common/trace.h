@@ -22,7 +22,7 @@
 #define GEOMETRY_PARAMETERS TRIANGLE_BUFFERS ALPHA_PARAMETERS
 
 /// Return what the rays of the lanes in `active` hit first; the others hit nothing.
-inline Hits closest_hits(
+static inline Hits closest_hits(
     __global const Params *params, Mask active, Vec3 origin, Vec3 direction, GEOMETRY_PARAMETERS)
 {
 #if FEW
@@ -35,7 +35,7 @@ inline Hits closest_hits(
 }
 
 /// Return for the lanes in `active` whether anything lies between `origin` and `origin` + `toward`.
-inline Mask blocked_rays(
+static inline Mask blocked_rays(
     __global const Params *params, Mask active, Vec3 origin, Vec3 toward, GEOMETRY_PARAMETERS)
 {
 #if FEW

@@ -6,7 +6,7 @@
 /// Pack a unit vector: 16 bits for each coordinate of the octahedron unfolded to a square.
 ///
 /// Cigolle et al.: A Survey of Efficient Representations for Independent Unit Vectors, JCGT 3 (2), 2014.
-inline UInt pack_unit(Vec3 n)
+static inline UInt pack_unit(Vec3 n)
 {
     const Float inverse = 1.0f / max(fabs(n.x) + fabs(n.y) + fabs(n.z), 1e-20f);
     Float x = n.x * inverse;
@@ -22,7 +22,7 @@ inline UInt pack_unit(Vec3 n)
     return a | (b << 16);
 }
 
-inline Vec3 unpack_unit(UInt packed)
+static inline Vec3 unpack_unit(UInt packed)
 {
     const Float x = to_float(packed & 0xffffu) * (1.0f / 32767.0f) - 1.0f;
     const Float y = to_float(packed >> 16) * (1.0f / 32767.0f) - 1.0f;
