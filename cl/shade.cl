@@ -221,7 +221,7 @@ kernel void shade_paths(
 #if CELLS
     // Light is divided by the reflectance of the base before it is shared: textures stay sharp.
 #if CELLS == 2
-    const Float base = base_gate(b, chances, wo_local.z);
+    const Float base = base_gate(chances);
     const Vec3 gate = mul(beta, scale(b.base_color, base));
 #else
     const Vec3 gate = mul(beta, b.base_color);

@@ -16,7 +16,7 @@ TABLES = {
     "[film]": toml_file.FILM,
     "[camera], [[cameras]]": toml_file.CAMERA,
     "[environment]": toml_file.ENVIRONMENT,
-    "[materials.NAME]": toml_file.MATERIAL,
+    "[materials.NAME]": toml_file.MATERIAL | toml_file.TEXTURE,
     "[[shapes]]": toml_file.SHAPE | toml_file.STEP,
     "[[lights]]": toml_file.LIGHT,
 }

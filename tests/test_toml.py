@@ -180,6 +180,49 @@ def test_a_texture_of_a_material_is_found_beside_the_scene(folder):
     assert scene.textures[0].pixels[0].tolist() == [[255, 0, 0, 255], [0, 255, 0, 255]]
 
 
+def test_a_texture_may_be_a_table_and_numbers_are_not_decoded(folder):
+    table = (
+        '{ file = "pixels.tga", uv_set = 1, scale = 2, rotation = 90, offset = [0.5, 0], '
+        'wrap = "mirror", filter = "nearest" }'
+    )
+    text = f"[materials.a]\nmetallic_roughness_texture = {table}\n" + QUAD + 'material = "a"\n'
+    text = text.replace("[[shapes]]", 'base_color_texture = "pixels.tga"\n[[shapes]]')
+    scene = load(folder, text)
+    material = scene.materials[scene.shapes[0].material]
+    base = scene.textures[material.base_color_texture]
+    rough = scene.textures[material.metallic_roughness_texture]
+    assert (base.srgb, base.wrap, base.filter) == (True, ("repeat", "repeat"), "linear")
+    assert (rough.srgb, rough.wrap, rough.filter) == (False, ("mirror", "mirror"), "nearest")
+    assert rough.uv_set == 1 and rough.pixels is base.pixels
+    np.testing.assert_allclose(rough.transform, (0, 2, 0.5, -2, 0, 0), atol=1e-12)
+
+
+def test_every_parameter_of_a_material_can_be_written(folder):
+    values = {
+        "specular_color": (0.5, 0.25, 1.0),
+        "thin_walled": True,
+        "attenuation_color": (0.5, 1.0, 0.25),
+        "attenuation_distance": 2.0,
+        "clearcoat": 0.5,
+        "clearcoat_roughness": 0.25,
+        "sheen_color": (1.0, 0.5, 0.0),
+        "sheen_roughness": 0.75,
+        "anisotropy": 0.5,
+        "normal_scale": -1.0,
+        "alpha": 0.5,
+        "unlit": True,
+    }
+    lines = "".join(
+        f"{name} = {json.dumps(value)}\n"
+        for name, value in (values | {"anisotropy_rotation": 90.0}).items()
+    )
+    scene = load(folder, f'[materials.a]\nalpha_mode = "blend"\n{lines}{QUAD}material = "a"\n')
+    material = scene.materials[0]
+    assert {name: getattr(material, name) for name in values} == values
+    assert material.alpha_mode == "blend"
+    assert material.anisotropy_rotation == pytest.approx(np.pi / 2)
+
+
 def test_a_spot_light_is_color_times_intensity_with_angles_in_radians(folder):
     text = """[[lights]]
 type = "spot"
@@ -329,9 +372,11 @@ MISTAKES = [
     ("[materials.a]\nbase_color = [1, 1, 2]\n", "materials.a.base_color: expected 3 finite"),
     ("[materials.a]\nroughness = -1\n", "materials.a.roughness: expected"),
     ("[materials.a]\nior = 0.5\n", "materials.a.ior: expected"),
-    ('[materials.a]\nalpha_mode = "BLEND"\n', "a.alpha_mode: expected one of opaque, mask"),
+    ('[materials.a]\nalpha_mode = "BLEND"\n', "a.alpha_mode: expected one of opaque, mask, blend"),
     ('[materials.a]\nbase_color_texture = "no.png"\n', "a.base_color_texture: no such file"),
     ('[materials.a]\nbase_color_texture = "tri.obj"\n', "materials.a.base_color_texture: "),
+    ("[materials.a]\nnormal_texture = { uv_set = 1 }\n", "normal_texture.file: missing"),
+    ('[materials.a]\nnormal_texture = { file = "no.png" }\n', "normal_texture.file: no such"),
     ("[materials]\na = 3\n", "materials.a: expected a table"),
     ("[shapes]\n", "shapes: expected an array of tables"),
     ("shapes = [3]\n", "shapes: expected an array of tables"),

@@ -46,6 +46,7 @@ typedef struct {
     Float to_mirror[5]; // coefficients of mirror_albedo for this roughness
     Float to_edge[4];   // and of edge_albedo
     Float gain;         // what scattering between facets adds to a white mirror, relatively
+    Float enters;       // share of the light that comes to the diffuse base, over that which leaves it
 #endif
 } LobeChances;
 
@@ -244,7 +245,12 @@ LARGE_FUNCTION LobeChances lobe_chances(Bsdf b, Float cos_o)
     const Float coat = b.coat * clear_coat_albedo(b.coat_alpha, cos_o);
     c.under_coat = c.under_sheen * (1.0f - coat);
 #endif
-    const Float f = dielectric_reflectance(b, coat_albedo(b, c, cos_o), cos_o);
+    const Float reflected = coat_albedo(b, c, cos_o);
+    c.enters = (1.0f - b.metallic) * (1.0f - reflected) / max(1.0f - average_coat_albedo(b), 1e-6f);
+#if TRANSMISSION
+    c.enters *= 1.0f - b.transmission;
+#endif
+    const Float f = dielectric_reflectance(b, reflected, cos_o);
     const Float color = max3(b.base_color);
     const Float metal_part = b.metallic * schlick(color, (Float)(1.0f), cos_o);
     const Float reflect = (1.0f - b.metallic) * f + metal_part;
@@ -388,31 +394,19 @@ static inline Float pdf_ggx_reflect(Vec3 wo, Vec3 h, Alphas alpha)
     return ggx_d(h, alpha) / (2.0f * (ggx_bound(wo, alpha) * wo.z + ggx_stretch(wo, alpha)));
 }
 
-/// Factors of f cos of the diffuse base beside its colour and what lies over the coat: that of wo ...
-static inline Float under_diffuse(Bsdf b, LobeChances chances, Float cos_o)
-{
-    const Float stays = 1.0f - average_coat_albedo(b);
-    Float under = (1.0f - b.metallic) * (1.0f - coat_albedo(b, chances, cos_o)) / max(stays, 1e-6f);
-#if TRANSMISSION
-    under *= 1.0f - b.transmission;
-#endif
-    return under;
-}
-
-/// ... and that of the light.
+/// Factor of the light in f cos of the diffuse base; that of wo is LobeChances.enters.
 static inline Float base_light(Bsdf b, LobeChances chances, Float cos_i)
 {
     return (1.0f - coat_albedo(b, chances, cos_i)) * cos_i * INV_PI;
 }
 
 /// Factor of wo of the diffuse base, beside its colour, under all that lies over it.
-static inline Float base_gate(Bsdf b, LobeChances chances, Float cos_o)
+static inline Float base_gate(LobeChances chances)
 {
-    const Float under = under_diffuse(b, chances, cos_o);
 #if LAYERS
-    return under * chances.under_coat;
+    return chances.enters * chances.under_coat;
 #else
-    return under;
+    return chances.enters;
 #endif
 }
 
@@ -448,8 +442,8 @@ LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Flo
     const Vec3 h = normalize3(add(wo, pick_v(facing, wi, wo)));
     const Float cos_h = clamp(dot3(wo, h), (Float)(0.0f), (Float)(1.0f));
 
-    const Float f = dielectric_reflectance(b, schlick(b.f0, b.specular, cos_h), cos_h);
     const Float edge = fifth_power_of_one_minus(cos_h);
+    const Float f = dielectric_reflectance(b, b.f0 + (b.specular - b.f0) * edge, cos_h);
     const Vec3 white = vec3_all((Float)(1.0f));
     Vec3 metal = add_scaled(b.base_color, sub(white, b.base_color), edge);
     metal = mul(metal, add_scaled(white, b.base_color, chances.gain));
@@ -464,7 +458,7 @@ LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Flo
     const Vec3 fresnel = lerp3(coat, metal, b.metallic);
     const Float mirror = ggx_d(h, alpha) * ggx_visibility(wo, wi, cos_i, alpha) * cos_i;
 
-    const Float under = under_diffuse(b, chances, wo.z) * base_light(b, chances, cos_i);
+    const Float under = chances.enters * base_light(b, chances, cos_i);
     Vec3 value = add_scaled(scale(fresnel, mirror), b.base_color, under);
     const Float seen_mirrored = pdf_ggx_reflect(wo, h, alpha);
     Float density = chances.diffuse * cos_i * INV_PI;
@@ -488,19 +482,21 @@ LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Flo
 
 #if TRANSMISSION
     Mask passes = behind;
-    if (any_lane(below)) {
-        const Float share = (1.0f - b.metallic) * b.transmission;
+    const Float share = (1.0f - b.metallic) * b.transmission;
+    if (any_lane(behind)) {
         const Float kept_back = fresnel_dielectric(cos_h, b.eta);
         const Float sheet = (1.0f - 2.0f * kept_back / (1.0f + kept_back) * b.specular) * share * mirror * raised;
         value = pick_v(behind, scale(b.base_color, sheet), value);
         density = pick(behind, chances.refract * seen_mirrored, density);
-
+    }
+    const Mask bent = below & !b.thin;
+    if (any_lane(bent)) {
         // The generalised half vector points to the side of the lower index; h is turned to wo's side.
         Vec3 ht = normalize3(add_scaled(wo, beyond, b.eta));
         ht = scale(ht, pick(ht.z < 0.0f, (Float)(-1.0f), (Float)(1.0f)));
         const Float oh = dot3(wo, ht);
         const Float ih = dot3(beyond, ht);
-        const Mask meets = below & !b.thin & (oh > 0.0f) & (ih < 0.0f);
+        const Mask meets = bent & (oh > 0.0f) & (ih < 0.0f);
         const Float root = ih + oh / b.eta;
         const Float root2 = max(root * root, 1e-12f);
         const Float jacobian = fabs(ih) / root2;
@@ -514,10 +510,10 @@ LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Flo
         value = pick_v(meets, scale(b.base_color, weight * through), value);
         density = pick(meets, chances.refract * seen * jacobian, density);
         passes |= meets;
-#if LAYERS
-        value = pick_v(passes, scale(value, chances.under_coat), value);
-#endif
     }
+#if LAYERS
+    value = pick_v(passes, scale(value, chances.under_coat), value);
+#endif
     *pdf = pick(above | passes, density, (Float)(0.0f));
     return pick_v(above | passes, value, vec3_all((Float)(0.0f)));
 #else

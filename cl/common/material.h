@@ -122,7 +122,7 @@ LARGE_FUNCTION Float map_normal(
 #endif
 
 /// Parameters of the BSDF in the lanes of `mask`; `anisotropy` is map_normal's.
-LARGE_FUNCTION Bsdf fetch_bsdf(
+static inline Bsdf fetch_bsdf(
     Mask mask,
     SurfacePoint s,
     Float u,
@@ -202,11 +202,12 @@ static inline Float exp_of_negative(Float x)
 /// What is left of light after `t` meters, where `s` was met from inside; Beer's law.
 static inline Vec3 attenuation(Mask hit, SurfacePoint s, Float t, __global const Material *materials)
 {
-    const Mask thin = (GATHER_U(materials, s.material, flags) & MATERIAL_THIN) != 0u;
-    const Mask inside = hit & !s.front & !thin & (GATHER(materials, s.material, transmission) > 0.0f);
     const Vec3 one = vec3_all((Float)(1.0f));
-    if (!any_lane(inside))
+    const Mask behind = hit & !s.front;
+    if (!any_lane(behind))
         return one;
+    const Mask thin = (GATHER_U(materials, s.material, flags) & MATERIAL_THIN) != 0u;
+    const Mask inside = behind & !thin & (GATHER(materials, s.material, transmission) > 0.0f);
     const Vec3 lost = scale(GATHER_COLOR(materials, s.material, absorption), -t);
     const Vec3 left = vec3(exp_of_negative(lost.x), exp_of_negative(lost.y), exp_of_negative(lost.z));
     return pick_v(inside, left, one);
