@@ -20,6 +20,7 @@ from psf_cl.scene.model import (
     has_layers,
     has_tangents,
     is_cut_out,
+    lets_through,
     shines,
 )
 from psf_cl.settings import Settings
@@ -293,7 +294,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "every material is matt",
         ),
         "TRANSMISSION": switch(
-            any(m.transmission > 0.0 and m.metallic < 1.0 for m in materials),
+            any(lets_through(m) for m in materials),
             "a material lets light through",
             "no material lets light through",
         ),

@@ -188,3 +188,20 @@ def test_roughness_and_metalness_come_from_green_and_blue(device):
         for m in (mapped, plain)
     ]
     np.testing.assert_allclose(images[0], images[1], rtol=1e-4)
+
+
+def test_a_texture_may_make_glass_of_a_metal(device):
+    """Metalness 1 times a texture of 0, and transmission: the sky behind is seen."""
+    glass = Material(
+        base_color=(1.0, 1.0, 1.0),
+        metallic=1.0,
+        roughness=0.0,
+        metallic_roughness_texture=0,
+        transmission=1.0,
+        thin_walled=True,
+        ior=1.0,
+    )
+    textures = [uniform((0, 0, 0, 255), srgb=False)]
+    scene = build([(quad(), IDENTITY, glass)], FRONT, textures=textures, environment=1.0)
+    # A tenth of the samples goes to a reflection that is next to nothing.
+    assert render(device, scene, 64).rgb.mean() == pytest.approx(1.0, abs=0.02)

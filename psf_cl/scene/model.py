@@ -284,6 +284,12 @@ def is_invisible(material: Material) -> bool:
     return material.alpha < least
 
 
+def lets_through(material: Material) -> bool:
+    """Return whether light passes ``material`` somewhere: where it is not metal."""
+    not_metal = material.metallic < 1.0 or material.metallic_roughness_texture >= 0
+    return material.transmission > 0.0 and not_metal
+
+
 def has_tangents(material: Material) -> bool:
     """Return whether directions along the surface matter to ``material``."""
     return material.normal_texture >= 0 or material.anisotropy > 0.0
