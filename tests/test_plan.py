@@ -241,6 +241,11 @@ def test_lights_are_sampled_only_where_the_settings_do(narrow, settings, flag, p
 def test_every_flag_at_once_renders(wants):
     flags = [flag for flag in CHOICES if flag != "ENVIRONMENT"]
     scene, _ = with_flags(*flags)
+    # Flags that bring others with them: colours of corners, a tangent frame, layers over the base.
+    layered = Material(clearcoat=1.0, anisotropy=0.5)
+    colored = replace(FLAT_QUAD, colors=np.ones((len(FLAT_QUAD.positions), 4), np.float32))
+    shape = replace(scene.shapes[0], mesh=colored, material=len(scene.materials))
+    scene = replace(scene, shapes=(*scene.shapes, shape), materials=(*scene.materials, layered))
     opened = renderer(wants(flags), scene, AOVS, path_filter="hash_grid")
     assert all(feature.value for feature in opened.plan.features.values())
     assert opened.plan.left_out == ()
