@@ -30,9 +30,13 @@ def device() -> Device:
         pytest.fail(f"{error}; to run only what needs no device: PSF_CL_ALLOW_NO_DEVICE=1")
 
 
-@pytest.fixture(scope="session", params=[1, 8, 16], ids=lambda lanes: f"W{lanes}")
+@pytest.fixture(
+    scope="session",
+    params=[1, pytest.param(8, marks=pytest.mark.slow), 16],
+    ids=lambda lanes: f"W{lanes}",
+)
 def lane_device(device: Device, request: pytest.FixtureRequest) -> Device:
-    """Return the same device with kernels for W = 1, 8 and 16 lanes."""
+    """Return the same device with kernels for W = 1, 8 (slow tests) and 16 lanes."""
     from psf_cl.device.device import Device
     from psf_cl.traits import DeviceTraits
 

@@ -144,7 +144,7 @@ def hand_in(device, radiance, direct):
     }
     flags = (
         "TEXTURES ALPHA SMOOTH TRANSMISSION AREA_LIGHTS PUNCTUAL_LIGHTS ENVIRONMENT CONNECT LENS"
-        " AOV_FEATURES FEW GLOSSY CELLS"
+        " AOV_FEATURES FEW GLOSSY VERTEX_COLORS TANGENTS LAYERS CELLS"
     ).split()
     program = load_program(device, "camera.cl", dict.fromkeys(flags, 0) | {"AOV_DIRECT": 1})
     program.bind("regenerate_paths", **buffers)(traits.slots // traits.lanes)
