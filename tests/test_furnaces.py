@@ -228,14 +228,13 @@ ANGLES = [0, 45, 75]
 
 @pytest.mark.parametrize("roughness", [0.1, 0.4, 1.0])
 @pytest.mark.parametrize("degrees", ANGLES)
-def test_white_metal_reflects_what_quadrature_says_and_never_more_than_it_gets(
-    device, roughness, degrees
-):
+def test_a_white_metal_gives_back_what_it_gets_and_never_more(device, roughness, degrees):
+    """One reflection alone gives back as little as 0.31: light between facets is compensated."""
     metal = Material(base_color=(1.0, 1.0, 1.0), metallic=1.0, roughness=roughness)
     seen, noise = seen_under_white_sky(device, metal, degrees)
-    truth = reflected(roughness**2, np.radians(degrees), np.ones_like)
-    assert abs(seen - truth) < Z_LIMIT * noise + 1e-3 * truth
-    assert seen < 1.001
+    once = reflected(roughness**2, np.radians(degrees), np.ones_like)
+    assert once - Z_LIMIT * noise < seen < 1.001
+    assert seen > 0.989 - Z_LIMIT * noise
     assert noise < 0.005
 
 
