@@ -547,8 +547,10 @@ def test_a_real_render_delivers_all_that_was_asked_for(device, all_features, cap
     assert sum(stats["occupancy"]) > 0
     ran = {stage["name"]: stage["launches"] for stage in stats["stages"]}
     assert min(ran[kernel] for kernel in ("shade_paths", "intersect_closest", "add_samples")) > 0
-    for part in ("render", "build", "compile", "load"):
+    for part in ("render", "build", "load"):
         assert 0.0 < stats[f"{part}_seconds"] < stats["process_seconds"]
+    # Two threads compile side by side, and their times are added.
+    assert 0.0 < stats["compile_seconds"] < 2 * stats["process_seconds"]
     last = stats["error"][-1]
     squared = np.mean((image.rgb.astype(np.float64) - 1.0) ** 2)
     assert last["spp"] == 3 and last["mse"] == pytest.approx(squared, rel=1e-5)
