@@ -48,8 +48,8 @@ static inline uint connect_paths(__global const Params *params, __global Float *
 ///
 /// Also paths that have ended may have a last one.
 ///
-/// reads   pool.{shadow, toward, light}; geometry
-/// writes  pool.radiance (direct), pool.light (cleared); counters.pending_shadow
+/// reads   pool.{shadow, toward, light, status, vertex}; geometry
+/// writes  pool.radiance (direct, beyond), pool.light (cleared); counters.pending_shadow
 kernel void connect_lights(
     __global const Params *params,
     __global float *pool,

@@ -71,7 +71,8 @@ static inline void store_features(
 /// Shade what the rays hit, prepare a shadow ray, and send the paths on or end them.
 ///
 /// reads   pool, scene tables
-/// writes  pool.{status, origin, direction, beta, radiance, direct, pdf, shadow, toward, light}; features
+/// writes  pool.{status, origin, direction, beta, radiance, direct, pdf, shadow, toward, light}; features;
+///         with CELLS pool.{vertex, length, beyond, share, light_share}, vertices
 kernel void shade_paths(
     __global const Params *params,
     __global const Surface *surfaces,
