@@ -65,6 +65,11 @@ class Plan:
         )
 
     @property
+    def in_epochs(self) -> bool:
+        """Return whether a stage works between passes, while no path is on its way."""
+        return any(stage.between_passes for stage in self.stages)
+
+    @property
     def total_bytes(self) -> int:
         return sum(buffer.bytes for buffer in self.buffers)
 

@@ -25,7 +25,7 @@ from psf_cl.measure.errors import error_of_halves
 from psf_cl.plan import Plan, make_plan
 from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Scene
-from psf_cl.scheduler import Hooks, Progress, Scheduler
+from psf_cl.scheduler import Hooks, Progress, Scheduler, doubling_epoch
 from psf_cl.settings import Settings, resolve
 from psf_cl.stages import cells, film
 
@@ -85,7 +85,9 @@ class Renderer:
             self.close()
             raise
         self.scheduler = Scheduler(
-            Hooks(self._bounce, self._film, self._counters, self._limit), self.plan.traits.slots
+            Hooks(self._bounce, self._film, self._counters, self._limit, self._between),
+            self.plan.traits.slots,
+            doubling_epoch if self.plan.in_epochs else None,
         )
 
     def _set_up(self) -> None:
@@ -148,6 +150,9 @@ class Renderer:
     def _limit(self, passes: int) -> None:
         value = np.array([passes], np.uint32)
         self.device.write(self.buffers["counters"], value, layout.COUNTER_INDEX["pass_limit"])
+
+    def _between(self, start: int) -> None:
+        """Do what the paths of an epoch need that begins with pass ``start``."""
 
     # Rendering.
 

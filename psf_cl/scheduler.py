@@ -25,6 +25,17 @@ MAX_PASSES = 1 << 31
 #: Bounces between two looks of the film at the ring of samples.
 BOUNCES_PER_FILM = 4
 
+#: Passes of the longest epoch: what is learned or emitted between epochs is that old at most.
+MAX_EPOCH = 64
+
+
+def doubling_epoch(start: int) -> int:
+    """Return the pass before which the epoch ends that starts with pass ``start``.
+
+    Epochs are 1, 1, 2, 4 .. MAX_EPOCH passes long: draining the pool soon costs next to nothing.
+    """
+    return start + min(max(start, 1), MAX_EPOCH)
+
 
 @dataclass(frozen=True)
 class Progress:
@@ -46,12 +57,14 @@ class Hooks:
         film: enqueue adding the complete passes to the film.
         counters: wait, and return the counters.
         limit: set the first pass that must not be started.
+        between: enqueue what happens while no path is on its way, before the pass that is named.
     """
 
     bounce: Callable[[], None]
     film: Callable[[], None]
     counters: Callable[[], np.ndarray]
     limit: Callable[[int], None]
+    between: Callable[[int], None] = lambda start: None
 
 
 class Clock:
@@ -77,15 +90,26 @@ class Clock:
 class Scheduler:
     """Runs passes.  Paths of later passes go on in the pool from one call to the next.
 
+    Tables that must not change while paths read them are written between epochs: runs of passes at
+    whose end the pool is empty.  Where they end depends on the number of the pass alone.
+
+    Args:
+        epoch_end: the pass before which the epoch ends that starts with a pass; None if nothing is
+            done between passes, so that the pool never needs to drain.
+
     Attributes:
         passes: whole passes that the film holds.
         rays: traced until the last look at the counters, by kind.
         clock: seconds spent in ``run``.
     """
 
-    def __init__(self, hooks: Hooks, slots: int) -> None:
+    def __init__(
+        self, hooks: Hooks, slots: int, epoch_end: Callable[[int], int] | None = None
+    ) -> None:
         self.hooks = hooks
         self.slots = slots
+        self.epoch_end = epoch_end
+        self.epoch = range(0 if epoch_end is not None else MAX_PASSES)
         self.passes = 0
         self.rays: dict[str, int] = {}
         self.clock = Clock()
@@ -110,11 +134,11 @@ class Scheduler:
         self._look_at_rays(self.hooks.counters())
         first_samples, last_rays = self.rays["camera"], sum(self.rays.values())
         first_seconds = self.clock.now()
-        limit = spp
-        self.hooks.limit(limit if limit is not None else MAX_PASSES)
+        limit = MAX_PASSES if spp is None else spp
         self.clock.start()
         try:
-            while self.passes < (MAX_PASSES if limit is None else limit):
+            self._start(limit)
+            while self.passes < limit:
                 begin = time.perf_counter()
                 for bounce in range(self.bounces):
                     self.hooks.bounce()
@@ -132,13 +156,22 @@ class Scheduler:
                     rate = samples / max(now - first_seconds, 1e-9)
                     if progress(Progress(self.passes, spp, now, seconds, rate)) is False:
                         return False
-                if seconds is not None and limit is None and now >= seconds:
+                if seconds is not None and now >= seconds:
                     # The pass in which the budget ends is finished; later ones are not begun.
-                    limit = min(self.passes + 1, MAX_PASSES)
-                    self.hooks.limit(limit)
+                    limit, seconds = min(self.passes + 1, MAX_PASSES), None
+                    self._start(limit)
+                elif self.passes == self.epoch.stop < limit:
+                    self._start(limit)
             return True
         finally:
             self.clock.stop()
+
+    def _start(self, limit: int) -> None:
+        """Let passes start up to ``limit``, or up to the end of the epoch."""
+        if self.epoch_end is not None and self.passes == self.epoch.stop < limit:
+            self.hooks.between(self.passes)
+            self.epoch = range(self.passes, self.epoch_end(self.passes))
+        self.hooks.limit(min(limit, self.epoch.stop))
 
     def _look_at_rays(self, counters: np.ndarray) -> None:
         self.rays = {kind: rays_so_far(counters, kind) for kind in RAY_KINDS}

@@ -75,6 +75,7 @@ class StageSpec:
         kernels: those that are launched.
         traces: whether it traces rays, which takes a stack of the tree's depth.
         per_pass: whether it works on complete passes, not on the pool.
+        between_passes: whether it works between epochs, which have the pool drain.
     """
 
     name: str
@@ -85,6 +86,7 @@ class StageSpec:
     buffers: tuple[BufferSpec, ...] = ()
     traces: bool = False
     per_pass: bool = False
+    between_passes: bool = False
 
     @property
     def kernel_names(self) -> tuple[str, ...]:
