@@ -11,10 +11,8 @@ from __future__ import annotations
 import math
 import reprlib
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,8 +26,8 @@ from psf_cl.scene.gltf_file import (
     MissingData,
     open_gltf,
 )
+from psf_cl.scene.gltf_material import MaterialReader
 from psf_cl.scene.model import (
-    MAX_RADIANCE,
     MAX_TRIANGLES,
     Camera,
     Light,
@@ -37,11 +35,8 @@ from psf_cl.scene.model import (
     Mesh,
     Scene,
     Shape,
-    Texture,
-    limited,
 )
-from psf_cl.scene.texture import decode_pixels
-from psf_cl.scene.transform import rotation_quaternion, uv_rows, without_scale
+from psf_cl.scene.transform import rotation_quaternion, without_scale
 
 # A file may list these as required; anything else required is refused.
 SUPPORTED = (
@@ -64,8 +59,6 @@ SUPPORTED = (
 MAX_SHAPES = 1 << 20
 MAX_WIDTH = 4096
 
-_WRAP = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
-_FILTER = {9728: "nearest", 9729: "linear"}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 
 
@@ -95,14 +88,12 @@ class _Reader:
     cameras: list[Camera] = field(default_factory=list)
     lights: list[Light] = field(default_factory=list)
     shapes: list[Shape] = field(default_factory=list)
-    materials: dict[int | None, int] = field(default_factory=dict)
-    material_list: list[Material] = field(default_factory=list)
-    textures: dict[tuple[Any, ...], int] = field(default_factory=dict)
-    texture_list: list[Texture] = field(default_factory=list)
-    pixels: dict[int, np.ndarray] = field(default_factory=dict)
     meshes: dict[int, list[tuple[Mesh, int | None]]] = field(default_factory=dict)
     aspect: float | None = None
     triangle_count: int = 0
+
+    def __post_init__(self) -> None:
+        self.materials = MaterialReader(self.gltf, self.notes, self.extensions)
 
     def scene(self, path: str) -> Scene:
         """Read all nodes of the default scene."""
@@ -128,8 +119,8 @@ class _Reader:
             width=min(max(width, 1), MAX_WIDTH),
             height=height,
             cameras=tuple(self.cameras),
-            textures=tuple(self.texture_list),
-            materials=tuple(self.material_list) or (Material(),),
+            textures=tuple(self.materials.textures),
+            materials=tuple(self.materials.materials) or (Material(),),
             shapes=tuple(self.shapes),
             lights=tuple(self.lights),
             notes=tuple(
@@ -138,12 +129,6 @@ class _Reader:
             ),
             files=(path, *self.gltf.files),
         )
-
-    def _limited(self, radiance: Iterable[float]) -> tuple[float, float, float]:
-        radiance = tuple(radiance)
-        if max(radiance) > MAX_RADIANCE:
-            self.notes[f"radiance and intensity above {MAX_RADIANCE:g} are set to that"] += 1
-        return limited(radiance)
 
     def _drawn_nodes(self, children: list[list[int]], parents: list[int]) -> list[int]:
         """Return the nodes below the roots of the default scene, parents first."""
@@ -242,7 +227,7 @@ class _Reader:
         self.lights.append(
             Light(
                 kind,
-                self._limited(intensity * channel for channel in color),
+                self.materials.limited(intensity * channel for channel in color),
                 light.text("name", ""),
                 position=tuple(transform[:3, 3].tolist()),
                 direction=tuple(direction.tolist()),
@@ -262,7 +247,9 @@ class _Reader:
         for mesh, material_index in self.meshes[mesh_index]:
             if len(self.shapes) == MAX_SHAPES:
                 node.fail("mesh", f"at most {MAX_SHAPES} primitives in all nodes together")
-            self.shapes.append(Shape(name, mesh, transform, self._material(material_index)))
+            self.shapes.append(
+                Shape(name, mesh, transform, self.materials.index_of(material_index))
+            )
 
     def _read_mesh(self, item: Item) -> list[tuple[Mesh, int | None]]:
         """Return the triangle meshes of all primitives with their material indices in the file."""
@@ -390,180 +377,6 @@ class _Reader:
                 skin.fail("inverseBindMatrices", "an accessor of finite matrices")
         return transform
 
-    # Materials and textures
-
-    def _material(self, index: int | None) -> int:
-        """Return the index in the scene of a material of the file; None is glTF's default."""
-        if index not in self.materials:
-            item = Item(self.gltf.root.file, "material", {})
-            if index is not None:
-                item = self.gltf.root.element("materials", index)
-            material = self._read_material(item)
-            self.materials[index] = len(self.material_list)
-            self.material_list.append(material)
-        return self.materials[index]
-
-    def _read_material(self, item: Item) -> Material:
-        empty = Item(item.file, "", {})
-        self.extensions.update(item.extension_names())
-        surface = item.item("pbrMetallicRoughness")
-
-        def extension(name: str) -> Item:
-            return item.extension(f"KHR_materials_{name}") or empty
-
-        emissive, refraction = extension("emissive_strength"), extension("ior")
-        transmission, volume = extension("transmission"), extension("volume")
-        specular, coat = extension("specular"), extension("clearcoat")
-        sheen, anisotropy = extension("sheen"), extension("anisotropy")
-
-        base = surface.numbers("baseColorFactor", (1.0, 1.0, 1.0, 1.0), 0.0, 1.0)
-        emission = item.numbers("emissiveFactor", (0.0, 0.0, 0.0), 0.0, 1.0)
-        strength = emissive.number("emissiveStrength", 1.0, 0.0)
-        alpha_mode = item.text("alphaMode", "OPAQUE")
-        if alpha_mode not in ("OPAQUE", "MASK", "BLEND"):
-            item.fail("alphaMode", "OPAQUE, MASK or BLEND")
-        ior = refraction.number("ior", 1.5, 0.0)
-        if 0.0 < ior < 1.0:
-            refraction.fail("ior", "0, or a number of at least 1")
-        if ior == 0.0:
-            self.notes["an ior of 0 is taken as 1.5"] += 1
-            ior = 1.5
-        distance = math.inf
-        if "attenuationDistance" in volume:
-            distance = volume.number("attenuationDistance", low=0.0)
-            if distance == 0.0:
-                volume.fail("attenuationDistance", "a number above 0")
-        self._note_ignored(
-            (item, "occlusionTexture"),
-            (coat, "clearcoatNormalTexture"),
-            (volume, "thicknessTexture"),
-        )
-        normal = item.item("normalTexture")
-        return Material(
-            item.text("name", "") or item.place,
-            base_color=base[:3],
-            base_color_texture=self._texture(surface, "baseColorTexture"),
-            alpha=base[3],
-            alpha_mode=alpha_mode.lower(),
-            alpha_cutoff=item.number("alphaCutoff", 0.5, 0.0),
-            metallic=surface.number("metallicFactor", 1.0, 0.0, 1.0),
-            roughness=surface.number("roughnessFactor", 1.0, 0.0, 1.0),
-            metallic_roughness_texture=self._texture(
-                surface, "metallicRoughnessTexture", srgb=False
-            ),
-            specular=specular.number("specularFactor", 1.0, 0.0, 1.0),
-            specular_texture=self._texture(specular, "specularTexture", srgb=False),
-            specular_color=self._specular_color(specular),
-            specular_color_texture=self._texture(specular, "specularColorTexture"),
-            ior=ior,
-            transmission=transmission.number("transmissionFactor", 0.0, 0.0, 1.0),
-            transmission_texture=self._texture(transmission, "transmissionTexture", srgb=False),
-            thin_walled=volume.number("thicknessFactor", 0.0, 0.0) == 0.0,
-            attenuation_color=volume.numbers("attenuationColor", (1.0, 1.0, 1.0), 0.0, 1.0),
-            attenuation_distance=distance,
-            clearcoat=coat.number("clearcoatFactor", 0.0, 0.0, 1.0),
-            clearcoat_texture=self._texture(coat, "clearcoatTexture", srgb=False),
-            clearcoat_roughness=coat.number("clearcoatRoughnessFactor", 0.0, 0.0, 1.0),
-            clearcoat_roughness_texture=self._texture(
-                coat, "clearcoatRoughnessTexture", srgb=False
-            ),
-            sheen_color=sheen.numbers("sheenColorFactor", (0.0, 0.0, 0.0), 0.0, 1.0),
-            sheen_color_texture=self._texture(sheen, "sheenColorTexture"),
-            sheen_roughness=sheen.number("sheenRoughnessFactor", 0.0, 0.0, 1.0),
-            sheen_roughness_texture=self._texture(sheen, "sheenRoughnessTexture", srgb=False),
-            anisotropy=anisotropy.number("anisotropyStrength", 0.0, 0.0, 1.0),
-            anisotropy_rotation=anisotropy.number("anisotropyRotation", 0.0),
-            anisotropy_texture=self._texture(anisotropy, "anisotropyTexture", srgb=False),
-            normal_texture=self._texture(item, "normalTexture", srgb=False),
-            normal_scale=normal.number("scale", 1.0),
-            emission=self._limited(channel * strength for channel in emission),
-            emission_texture=self._texture(item, "emissiveTexture") if any(emission) else -1,
-            double_sided=item.flag("doubleSided"),
-            unlit=item.extension("KHR_materials_unlit") is not None,
-        )
-
-    def _specular_color(self, specular: Item) -> tuple[float, ...]:
-        color = specular.numbers("specularColorFactor", (1.0, 1.0, 1.0), 0.0)
-        if max(color) > 1.0:
-            self.notes["specularColorFactor above 1 is taken as 1"] += 1
-        return tuple(min(channel, 1.0) for channel in color)
-
-    def _note_ignored(self, *keys: tuple[Item, str]) -> None:
-        for item, key in keys:
-            if key in item:
-                self.notes[f"the material property {key} is ignored"] += 1
-
-    def _texture(self, owner: Item, key: str, srgb: bool = True) -> int:
-        """Return the index in the scene of the texture that ``owner[key]`` uses, or -1 for none."""
-        if key not in owner:
-            return -1
-        info = owner.item(key)
-        self.extensions.update(info.extension_names())
-        uv_set = info.integer("texCoord", 0)
-        matrix = Texture.transform
-        change = info.extension("KHR_texture_transform")
-        if change is not None:
-            uv_set = change.integer("texCoord", uv_set)
-            matrix = _texture_transform(change)
-        if uv_set > 1:
-            self.notes["textures with texture coordinates beyond TEXCOORD_1 are ignored"] += 1
-            return -1
-        texture_index = self.gltf.index(info, "index", "textures")
-        if texture_index is None:
-            info.fail("index", "an index of textures")
-        texture = self.gltf.root.element("textures", texture_index)
-        image_index = self.gltf.index(texture, "source", "images")
-        webp = texture.extension("EXT_texture_webp")
-        if webp is not None:
-            image_index = self.gltf.index(webp, "source", "images")
-        if image_index is None:
-            self.notes["textures without an image are ignored"] += 1
-            return -1
-        wrap, magnification = self._sampler(texture)
-        used = (image_index, srgb, wrap, magnification, uv_set, matrix)
-        if used not in self.textures:
-            image = self.gltf.root.element("images", image_index)
-            name = image.text("name", "") or image.place
-            try:
-                pixels = self._pixels(image_index, image)
-            except MissingData:
-                self.notes["textures whose buffer has no data are ignored"] += 1
-                return -1
-            self.textures[used] = len(self.texture_list)
-            self.texture_list.append(
-                Texture(name, pixels, srgb, wrap, magnification, uv_set, matrix)
-            )
-        return self.textures[used]
-
-    def _sampler(self, texture: Item) -> tuple[tuple[str, str], str]:
-        """Return the wrap modes of u and v, and the filter."""
-        index = self.gltf.index(texture, "sampler", "samplers")
-        if index is None:
-            return ("repeat", "repeat"), "linear"
-        sampler = self.gltf.root.element("samplers", index)
-        wrap = []
-        for key in ("wrapS", "wrapT"):
-            number = sampler.integer(key, 10497)
-            if number not in _WRAP:
-                sampler.fail(key, f"one of {', '.join(str(known) for known in _WRAP)}")
-            wrap.append(_WRAP[number])
-        number = sampler.integer("magFilter", 9729)
-        if number not in _FILTER:
-            sampler.fail("magFilter", f"one of {', '.join(str(known) for known in _FILTER)}")
-        return (wrap[0], wrap[1]), _FILTER[number]
-
-    def _pixels(self, index: int, image: Item) -> np.ndarray:
-        if index not in self.pixels:
-            if "uri" in image:
-                data = self.gltf.resource(image)
-            else:
-                view_index = self.gltf.index(image, "bufferView", "bufferViews")
-                if view_index is None:
-                    image.fail("bufferView", "an index of bufferViews, or a uri")
-                data = bytes(self.gltf.view_data(view_index))
-            self.pixels[index] = decode_pixels(data, f"{image.file}: {image.place}")
-        return self.pixels[index]
-
 
 def _check_version(asset: Item) -> None:
     """Refuse anything but glTF 2 that a reader of 2.0 may read."""
@@ -651,13 +464,6 @@ def _assemble_triangles(indices: np.ndarray, mode: int) -> np.ndarray:
         odd = first % 2
         return indices[np.stack([first, first + 1 + odd, first + 2 - odd], axis=1)]
     return indices[np.stack([first + 1, first + 2, first * 0], axis=1)]
-
-
-def _texture_transform(change: Item) -> tuple[float, ...]:
-    """Return the rows of the matrix that KHR_texture_transform describes."""
-    offset = change.numbers("offset", (0.0, 0.0))
-    scale = change.numbers("scale", (1.0, 1.0))
-    return uv_rows(offset, change.number("rotation", 0.0), scale)
 
 
 def _unit_normals(normals: np.ndarray, positions: np.ndarray, triangles: np.ndarray) -> np.ndarray:
