@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import glob
+import hashlib
 import os
+import platform
 import secrets
+from collections.abc import Iterable
 from pathlib import Path
 
 from psf_cl.errors import InputError
@@ -48,10 +53,20 @@ def write_whole(path: str | os.PathLike[str], data: bytes) -> None:
     Raises:
         InputError: it cannot be written; nothing is left behind and an old file stays as it was.
     """
+    write_parts(path, (data,))
+
+
+def write_parts(path: str | os.PathLike[str], parts: Iterable[bytes | memoryview]) -> None:
+    """Write ``parts``, one after another, as ``write_whole`` does."""
     target, part = _target_and_part(path)
     try:
         try:
-            part.write_bytes(data)
+            with part.open("xb") as file:
+                for data in parts:
+                    file.write(data)
+                # The name must not outlive the content if the power fails.
+                file.flush()
+                os.fsync(file.fileno())
             part.replace(target)
         finally:
             part.unlink(missing_ok=True)
@@ -59,10 +74,37 @@ def write_whole(path: str | os.PathLike[str], data: bytes) -> None:
         raise InputError(f"{path}: cannot write: {_reason(error, target)}") from error
 
 
+def remove_leftovers(path: str | os.PathLike[str]) -> None:
+    """Remove what processes that were killed while they wrote ``path`` have left beside it."""
+    target = Path(os.path.realpath(path))
+    for part in target.parent.glob(glob.escape(f"{_prefix(target)}") + "*.part"):
+        process = part.name.removeprefix(_prefix(target)).split("-")[0]
+        if process.isdecimal() and not _runs(int(process)):
+            with contextlib.suppress(OSError):
+                part.unlink()
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        return True
+    return True
+
+
 def _target_and_part(path: str | os.PathLike[str]) -> tuple[Path, Path]:
     # A rename would replace a symbolic link by the file: follow it first.
     target = Path(os.path.realpath(path))
-    return target, target.with_name(f".psf_cl-{secrets.token_hex(4)}.part")
+    name = f"{_prefix(target)}{os.getpid()}-{secrets.token_hex(4)}.part"
+    return target, target.with_name(name)
+
+
+def _prefix(target: Path) -> str:
+    # Short, whatever the length of the target's name; numbers of processes are those of a machine.
+    whose = os.fsencode(target.name) + b"/" + platform.node().encode()
+    return f".psf_cl-{hashlib.sha256(whose).hexdigest()[:8]}-"
 
 
 def _reason(error: OSError, target: Path) -> str:

@@ -4,25 +4,30 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from psf_cl import tables
+from psf_cl import __version__, tables
+from psf_cl.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from psf_cl.device import layout
 from psf_cl.device.bvh import MIN_STACK_SIZE, Bvh, build_bvh, warm_up_builder
 from psf_cl.device.device import Buffer, Device, open_device
 from psf_cl.device.program import Launch, Program, load_program
+from psf_cl.device.sources import source_digest
 from psf_cl.errors import DeviceError, InputError
 from psf_cl.image import Image
 from psf_cl.measure.errors import error_of_halves
 from psf_cl.plan import Plan, make_plan
+from psf_cl.scene.digest import scene_digest
 from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Scene
 from psf_cl.scheduler import Hooks, Progress, Scheduler, doubling_epoch
@@ -74,6 +79,7 @@ class Renderer:
         )
         self.compile_seconds = 0.0
         self.statistics = statistics
+        self.other_device = ""
         self.looks = 0
         self.censuses = 0
         self.programs: dict[str, Program] = {}
@@ -303,6 +309,86 @@ class Renderer:
             full_height=self.scene.height,
         )
 
+    def save(self, path: str | os.PathLike[str]) -> bool:
+        """Write a checkpoint, if this is a moment for one.
+
+        While tables are being filled by the paths of an epoch it is not; passes then stop to begin
+        until ``render``'s ``progress`` has seen a moment, at which this is to be called again.
+
+        Returns:
+            Whether it is written.
+
+        Raises:
+            InputError: the file cannot be written; an older one stays as it was.
+        """
+        if not self.scheduler.at_rest:
+            self.scheduler.rest()
+            return False
+        epoch = self.scheduler.epoch
+        contents = {
+            name: self.device.read(self.buffers[name], count)
+            for name, (_, count) in self._lasting().items()
+        }
+        state = Checkpoint(
+            self.identity,
+            self.scheduler.passes,
+            (epoch.start, epoch.stop),
+            self.scheduler.clock.now(),
+            self.device.name,
+            contents,
+        )
+        write_checkpoint(path, state)
+        return True
+
+    def resume(self, path: str | os.PathLike[str]) -> None:
+        """Go on from a checkpoint of the same render; only before the first pass.
+
+        The budgets of ``render`` count what the checkpoint holds, and the image gets the bits of a
+        render that never stopped (on the same device).
+
+        Raises:
+            InputError: the file is no checkpoint, is damaged, or is of another render.
+        """
+        state = read_checkpoint(path, self.identity, self._lasting())
+        counters = state.buffers["counters"]
+        index = layout.COUNTER_INDEX
+        # What was on its way has to start again.
+        for name in ("next_pixel", "pass_limit", "pending_camera", "pending_bounce"):
+            counters[index[name]] = 0
+        counters[index["pending_shadow"]] = 0
+        counters[[index["next_pass"], index["film_pass"]]] = state.passes
+        for name, array in state.buffers.items():
+            self.device.write(self.buffers[name], array)
+        self.scheduler.resume(state.passes, state.epoch, state.seconds)
+        if state.device != self.device.name:
+            self.other_device = state.device
+
+    @cached_property
+    def identity(self) -> dict[str, Any]:
+        """Return what a checkpoint of this render belongs to, as plain JSON values."""
+        return {
+            "version": f"{__version__} {source_digest()}",
+            "scene": scene_digest(self.scene),
+            "settings": asdict(self.settings),
+            "picture": {
+                "size": [self.scene.width, self.scene.height],
+                "crop": list(self.plan.crop),
+                "aov": sorted(self.plan.outputs),
+                "noise": "film_half" in self.buffers,
+            },
+        }
+
+    def _lasting(self) -> dict[str, tuple[np.dtype[Any], int]]:
+        """Return what a checkpoint holds: type and items of each buffer."""
+        specs = (spec for stage in self.plan.stages for spec in stage.buffers if not spec.passing)
+        lasting = {
+            spec.name: (self.buffers[spec.name].dtype, self.buffers[spec.name].count)
+            for spec in specs
+        }
+        # Behind them is what is on its way.
+        lasting["counters"] = (lasting["counters"][0], layout.COUNTER_INDEX["finished"])
+        return lasting
+
     def stats(self) -> dict[str, Any]:
         """Return what ``--stats`` writes, without errors against a reference."""
         counters = self.device.read(self.buffers["counters"], layout.COUNTER_INDEX["finished"])
@@ -361,9 +447,17 @@ class Renderer:
     @property
     def notes(self) -> tuple[str, ...]:
         """What a user should know that only building the scene has shown, one sentence each."""
-        if not self.dropped_triangles:
-            return ()
-        return (f"{self.dropped_triangles} triangles are left out: a coordinate is not finite",)
+        notes = []
+        if self.dropped_triangles:
+            notes.append(
+                f"{self.dropped_triangles} triangles are left out: a coordinate is not finite"
+            )
+        if self.other_device:
+            notes.append(
+                f"the checkpoint is from {self.other_device}: the image will not be that of one "
+                "device, bit for bit"
+            )
+        return tuple(notes)
 
     def close(self) -> None:
         """Give the device memory back."""

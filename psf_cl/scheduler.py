@@ -101,6 +101,7 @@ class Scheduler:
         passes: whole passes that the film holds.
         rays: traced until the last look at the counters, by kind.
         clock: seconds spent in ``run``.
+        stop: first pass that may not start.
     """
 
     def __init__(
@@ -111,9 +112,33 @@ class Scheduler:
         self.epoch_end = epoch_end
         self.epoch = range(0 if epoch_end is not None else MAX_PASSES)
         self.passes = 0
+        self.stop = 0
+        self.started = 0
+        self.resting = False
         self.rays: dict[str, int] = {}
         self.clock = Clock()
         self.bounces = 1
+
+    @property
+    def at_rest(self) -> bool:
+        """Return whether tables and film are those of whole passes alone.
+
+        Without epochs they always are: what is on its way has left no trace.
+        """
+        return self.epoch_end is None or self.passes >= self.stop
+
+    def rest(self) -> None:
+        """Start no further pass until ``at_rest`` was seen once: a moment to save everything.
+
+        What is rendered does not change.  Without epochs there is nothing to wait for.
+        """
+        self.resting = self.epoch_end is not None
+
+    def resume(self, passes: int, epoch: tuple[int, int], seconds: float) -> None:
+        """Go on where another scheduler was at rest."""
+        self.passes = passes
+        self.epoch = range(*epoch)
+        self.clock.seconds = seconds
 
     def run(
         self,
@@ -146,6 +171,7 @@ class Scheduler:
                         self.hooks.film()
                 counters = self.hooks.counters()
                 self.passes = int(counters[COUNTER_INDEX["film_pass"]])
+                self.started = int(counters[COUNTER_INDEX["next_pass"]]) + 1
                 self._look_at_rays(counters)
                 rays = sum(self.rays.values())
                 self._adapt(time.perf_counter() - begin, rays - last_rays)
@@ -156,6 +182,8 @@ class Scheduler:
                     rate = samples / max(now - first_seconds, 1e-9)
                     if progress(Progress(self.passes, spp, now, seconds, rate)) is False:
                         return False
+                if self.resting:
+                    self._rest(limit)
                 if seconds is not None and now >= seconds:
                     # The pass in which the budget ends is finished; later ones are not begun.
                     limit, seconds = min(self.passes + 1, MAX_PASSES), None
@@ -171,7 +199,19 @@ class Scheduler:
         if self.epoch_end is not None and self.passes == self.epoch.stop < limit:
             self.hooks.between(self.passes)
             self.epoch = range(self.passes, self.epoch_end(self.passes))
-        self.hooks.limit(min(limit, self.epoch.stop))
+        self._stop_at(min(limit, self.epoch.stop))
+
+    def _rest(self, limit: int) -> None:
+        """Let the passes that have begun come to their end; then go on."""
+        if self.passes >= self.stop:
+            self.resting = False
+            self._start(limit)
+        elif self.stop > self.started:
+            self._stop_at(self.started)
+
+    def _stop_at(self, passes: int) -> None:
+        self.stop = passes
+        self.hooks.limit(passes)
 
     def _look_at_rays(self, counters: np.ndarray) -> None:
         self.rays = {kind: rays_so_far(counters, kind) for kind in RAY_KINDS}

@@ -18,7 +18,7 @@ import pytest
 import psf_cl.image
 from psf_cl.cli.main import main
 from psf_cl.cli.progress import describe, seconds_left
-from psf_cl.errors import DeviceError
+from psf_cl.errors import DeviceError, InputError
 from psf_cl.image import AOVS, Image, read_exr, write_exr
 from psf_cl.scene.model import Scene
 from psf_cl.settings import Settings
@@ -317,19 +317,34 @@ def test_a_missing_pyopencl_is_one_line(fake, monkeypatch, capsys):
     assert "psf-cl doctor" in one_error(capsys.readouterr())
 
 
-def test_the_first_ctrl_c_keeps_what_is_rendered(fake, tmp_path, capsys):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_first_ctrl_c_or_sigterm_keeps_what_is_rendered(fake, tmp_path, capsys, number):
     def press(passes):
         if passes == 3:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
 
     fake.on_pass = staticmethod(press)
-    before = signal.getsignal(signal.SIGINT)
+    before = signal.getsignal(number)
     assert main("render a.toml --spp 1000 --stats s.json".split()) == 130
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(number) is before
     assert files_in(tmp_path) == ["a.exr", "a.png", "s.json"]
     assert read_exr("a.exr").stats["spp"] == 3
     captured = capsys.readouterr()
     assert captured.out.startswith("a.exr: 3 spp") and "interrupted" in captured.err
+
+
+def test_a_checkpoint_that_cannot_be_written_costs_no_picture(fake, tmp_path, capsys):
+    def save(self, path):
+        raise InputError(f"{path}: cannot write: No space left on device")
+
+    fake.save = save
+    command = "render a.toml --spp 9 --checkpoint c.state --checkpoint-seconds 0.5"
+    assert main(command.split()) == 2
+    assert files_in(tmp_path) == ["a.exr", "a.png"] and read_exr("a.exr").stats["spp"] == 9
+    lines = capsys.readouterr().err.splitlines()
+    told = "c.state: cannot write: No space left on device"
+    assert f"note: {told}; rendering goes on without a checkpoint" in lines
+    assert lines[-1] == f"psf-cl: error: {told}"
 
 
 @pytest.mark.parametrize("moment", ["image", "write_exr", "write_png"])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from psf_cl.device.layout import COUNTER_INDEX
-from psf_cl.scheduler import MAX_EPOCH, Hooks, Scheduler, doubling_epoch
+from psf_cl.scheduler import MAX_EPOCH, Hooks, Progress, Scheduler, doubling_epoch
 
 
 class CountingPool:
@@ -23,9 +23,7 @@ class CountingPool:
         self.finished = min(self.finished + 1, self.last)
 
     def counters(self) -> np.ndarray:
-        values = np.zeros(max(COUNTER_INDEX.values()) + 1, np.uint32)
-        values[COUNTER_INDEX["film_pass"]] = self.finished
-        return values
+        return counters_of(self)
 
     def limit(self, passes: int) -> None:
         self.last = passes
@@ -33,6 +31,13 @@ class CountingPool:
     def between(self, start: int) -> None:
         assert self.finished == start == self.last, "paths are on their way"
         self.starts.append(start)
+
+
+def counters_of(pool: CountingPool, begun: int = 0) -> np.ndarray:
+    values = np.zeros(max(COUNTER_INDEX.values()) + 1, np.uint32)
+    values[COUNTER_INDEX["film_pass"]] = pool.finished
+    values[COUNTER_INDEX["next_pass"]] = begun
+    return values
 
 
 def _scheduler(pool: CountingPool, in_epochs: bool = True) -> Scheduler:
@@ -74,3 +79,33 @@ def test_nothing_happens_between_passes_without_epochs() -> None:
     pool = CountingPool()
     assert _scheduler(pool, in_epochs=False).run(40, None)
     assert pool.starts == [] and pool.finished == 40
+
+
+def test_a_rest_comes_at_the_end_of_the_passes_that_have_begun_and_moves_no_epoch() -> None:
+    pool = CountingPool()
+    pool.counters = lambda: counters_of(pool, begun=pool.finished + 3)
+    scheduler = _scheduler(pool)
+    scheduler.bounces = 1
+    rests = []
+
+    def progress(now: Progress) -> bool:
+        if now.passes in (20, 40) or scheduler.resting:
+            if scheduler.at_rest:
+                rests.append(now.passes)
+            else:
+                scheduler.rest()
+        scheduler.bounces = 1
+        return True
+
+    assert scheduler.run(50, None, progress)
+    # When 20 passes are done, those up to the 23rd have begun.
+    assert rests == [24, 44]
+    assert pool.starts == [0, 1, 2, 4, 8, 16, 32]
+
+
+def test_without_epochs_every_moment_is_one_of_rest() -> None:
+    pool = CountingPool()
+    scheduler = _scheduler(pool, in_epochs=False)
+    scheduler.rest()
+    assert scheduler.at_rest and not scheduler.resting
+    assert scheduler.run(40, None, lambda now: scheduler.at_rest)

@@ -52,7 +52,8 @@ def program() -> NoReturn:
     At once: an interrupted command may leave a thread in a compiler, which cannot be stopped and
     crashes when the libraries are unloaded below it.
     """
-    signal.signal(signal.SIGINT, _interrupt)
+    for each in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(each, _interrupt)
     _end(main())
 
 

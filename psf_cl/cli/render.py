@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
+import os
 import signal
 import sys
 import threading
@@ -38,6 +39,9 @@ if TYPE_CHECKING:
     from psf_cl.scene.model import Scene
 
 DEFAULT_SPP = 64
+
+#: Signals that ask for an end with all that is there.
+INTERRUPTS = (signal.SIGINT, signal.SIGTERM)
 
 
 def add_parser(commands: Any) -> None:
@@ -86,20 +90,40 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--stats", metavar="FILE.json", type=file_argument, help="write times, counts and errors"
     )
+    parser.add_argument(
+        "--checkpoint",
+        metavar="FILE",
+        type=file_argument,
+        help="write what it takes to go on: now and then, at the end, and when interrupted",
+    )
+    parser.add_argument(
+        "--checkpoint-seconds",
+        metavar="S",
+        type=positive_number,
+        default=30.0,
+        help="render time between two checkpoints (default 30)",
+    )
+    parser.add_argument(
+        "--resume",
+        metavar="FILE",
+        type=file_argument,
+        help="go on from a checkpoint; budgets count what it holds",
+    )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Check everything that can be checked, render, write; return 130 if interrupted on the way."""
-    from psf_cl.files import check_writable, write_whole
+    from psf_cl.files import check_writable, remove_leftovers, write_whole
     from psf_cl.image import json_text, output_paths, write_exr, write_png
     from psf_cl.plan import make_plan
 
     exr, png = output_paths(args.output or f"{Path(args.scene).stem}.exr")
-    outputs = [exr, png] + ([Path(args.stats)] if args.stats else [])
+    outputs = [exr, png] + [Path(name) for name in (args.stats, args.checkpoint) if name]
     for path in outputs:
         check_writable(path)
+        remove_leftovers(path)
     statistics = args.stats is not None
     # The device gets ready while the scene is read; a mistake in the scene does not wait for it.
     background = ThreadPoolExecutor(1)
@@ -108,7 +132,7 @@ def run(args: argparse.Namespace) -> int:
         opening = background.submit(open_prepared_device, args.device, statistics, read)
         scene, settings = load_with_settings(args)
         read.set()
-        check_distinct(outputs, [*scene.files, args.reference])
+        check_distinct(outputs, [*scene.files, args.reference, _other_checkpoint(args)])
         make_plan(scene, settings, args.aov, crop=args.crop)  # For its checks.
         reference = _reference(args, scene) if args.reference else None
         device = opening.result()
@@ -128,17 +152,22 @@ def run(args: argparse.Namespace) -> int:
         statistics=statistics,
         halves=args.noise is not None,
     )
+    if args.resume:
+        with closed_on_error(renderer):
+            _resume(renderer, args)
     if not args.quiet:
         tell_notes(renderer.notes)
     # Until the files are written, Ctrl-C must not throw the picture away.
     with stop_on_interrupt() as interrupted:
         with contextlib.closing(renderer):
             curve = ErrorCurve(reference)
+            checkpoints = Checkpoints(renderer, args.checkpoint, args.checkpoint_seconds)
             with ProgressDisplay(args.quiet) as display:
 
                 def on_progress(progress: Progress) -> bool:
                     display.update(progress)
                     curve.follow(renderer, progress)
+                    checkpoints.follow(progress)
                     return not interrupted()
 
                 if args.noise:
@@ -148,6 +177,7 @@ def run(args: argparse.Namespace) -> int:
                     renderer.render(spp=spp, seconds=args.seconds, progress=on_progress)
             image = renderer.image()
             stats = image.stats
+            checkpoints.save(stats["spp"])
             if args.noise:
                 stats["estimated_relmse"] = renderer.estimated_error()
             if not stats["spp"] and not renderer.snapshot(("rgb", "samples")).aovs["samples"].any():
@@ -163,6 +193,8 @@ def run(args: argparse.Namespace) -> int:
             stats["process_seconds"] = time.perf_counter() - START
             write_whole(args.stats, (json_text(stats, indent=2) + "\n").encode())
         stopped = interrupted()
+    if checkpoints.failure is not None:
+        raise checkpoints.failure
     if not args.quiet:
         print(_summary(exr, image))
     if stopped:
@@ -179,6 +211,79 @@ def open_prepared_device(
     except ImportError as error:
         raise DeviceError(f"no OpenCL ({error}); psf-cl doctor says what to do") from error
     return prepare_device(text, profiling, read)
+
+
+def _resume(renderer: Renderer, args: argparse.Namespace) -> None:
+    renderer.resume(args.resume)
+    passes = renderer.scheduler.passes
+    if args.spp and passes > args.spp:
+        raise InputError(
+            f"--spp: {args.resume} holds {passes} samples a pixel already, got {args.spp}"
+        )
+
+
+def _other_checkpoint(args: argparse.Namespace) -> str | None:
+    """Return the file that is resumed, unless it is the one to be written too, as it may be."""
+    same = args.resume and args.checkpoint
+    same = same and os.path.realpath(args.resume) == os.path.realpath(args.checkpoint)
+    return None if same else args.resume
+
+
+@contextlib.contextmanager
+def closed_on_error(renderer: Renderer) -> Iterator[None]:
+    """Give the device memory back if what is done inside fails."""
+    try:
+        yield
+    except BaseException:
+        renderer.close()
+        raise
+
+
+class Checkpoints:
+    """Writes a checkpoint whenever one is due.
+
+    Args:
+        path: of the file; None for no checkpoints.
+        seconds: render time between two.  Where writing takes long they are further apart, so that
+            it costs a twentieth of the time at most.
+
+    Attributes:
+        failure: why the last one could not be written: no reason to lose the picture too.
+    """
+
+    def __init__(self, renderer: Renderer, path: str | None, seconds: float) -> None:
+        self.failure: InputError | None = None
+        self._renderer = renderer
+        self._path = path
+        self._seconds = seconds
+        self._next: float | None = None
+
+    def follow(self, progress: Progress) -> None:
+        """Save if it is time to; render time does not count it."""
+        if self._path is None:
+            return
+        if self._next is None:
+            self._next = progress.seconds + self._seconds
+        if progress.seconds >= self._next:
+            with self._renderer.outside_time():
+                start = time.perf_counter()
+                if self.save(progress.passes):
+                    pause = max(self._seconds, 20.0 * (time.perf_counter() - start))
+                    self._next = progress.seconds + pause
+
+    def save(self, passes: int) -> bool:
+        """Write the checkpoint; return False if this is no moment for one."""
+        if self._path is None or passes == 0:
+            return False
+        try:
+            done = self._renderer.save(self._path)
+            self.failure = None
+            return done
+        except InputError as error:
+            if self.failure is None:
+                tell_notes([f"{error}; rendering goes on without a checkpoint"])
+            self.failure = error
+            return True
 
 
 class ErrorCurve:
@@ -217,23 +322,26 @@ class ErrorCurve:
 def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
     """Give a function that says whether Ctrl-C was pressed; the second Ctrl-C interrupts at once.
 
-    Outside the main thread, where Python delivers no signals, Ctrl-C keeps its meaning.
+    SIGTERM is another Ctrl-C.  Outside the main thread, where Python delivers no signals, both keep
+    their meanings.
     """
     pressed = False
 
     def on_signal(number: int, frame: object) -> None:
         nonlocal pressed
         pressed = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        for each in INTERRUPTS:
+            signal.signal(each, signal.default_int_handler)
 
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
-    before = signal.signal(signal.SIGINT, on_signal)
+    before = {each: signal.signal(each, on_signal) for each in INTERRUPTS}
     try:
         yield lambda: pressed
     finally:
-        signal.signal(signal.SIGINT, before)
+        for each, handler in before.items():
+            signal.signal(each, handler)
 
 
 def _reference(args: argparse.Namespace, scene: Scene) -> np.ndarray:

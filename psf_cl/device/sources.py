@@ -1,5 +1,6 @@
 """Where the OpenCL sources are."""
 
+import hashlib
 from pathlib import Path
 
 from psf_cl.errors import DeviceError
@@ -19,3 +20,12 @@ def kernel_folder() -> Path:
         if (folder / "common").is_dir():
             return folder
     raise DeviceError(f"the OpenCL sources are missing: no folder {package / 'cl'}; install again")
+
+
+def source_digest() -> str:
+    """Return a fingerprint of all OpenCL sources."""
+    folder = kernel_folder()
+    digest = hashlib.sha256()
+    for path in sorted(p for p in folder.rglob("*") if p.suffix in (".cl", ".h")):
+        digest.update(f"{path.relative_to(folder).as_posix()}\n".encode() + path.read_bytes())
+    return digest.hexdigest()[:16]

@@ -14,16 +14,20 @@ def plan(context: Context) -> StageSpec:
     samples = context.ring * context.pixel_count * 4
     float32, uint32 = np.dtype(np.float32), np.dtype(np.uint32)
     buffers = [
-        BufferSpec("pool", float32, slots * context.path_field_count, f"state of {slots} paths"),
+        BufferSpec(
+            "pool", float32, slots * context.path_field_count, f"state of {slots} paths", True
+        ),
         BufferSpec(
             "counters", uint32, layout.COUNTER_INDEX["finished"] + context.ring, "queue and rays"
         ),
-        BufferSpec("samples", float32, samples, f"radiance of {context.ring} passes in flight"),
+        BufferSpec(
+            "samples", float32, samples, f"radiance of {context.ring} passes in flight", True
+        ),
     ]
     direct: tuple[str, ...] = ()
     if context.on("AOV_DIRECT"):
         direct = ("direct",)
-        buffers.append(BufferSpec("direct", float32, samples, "direct light of the same"))
+        buffers.append(BufferSpec("direct", float32, samples, "direct light of the same", True))
     shared = ("beyond", "vertex") if context.on("CELLS") else ()
     started = ("origin", "direction", "beta", "radiance", *direct, "seed", "status")
     named = ("sample", "pixel")

@@ -81,16 +81,17 @@ def plan(context: Context) -> StageSpec | None:
     in_flight = f"of {context.ring} passes in flight"
     buffers = (
         BufferSpec(
-            "beyond", layout.BEYOND.dtype, samples, f"light behind the vertices {in_flight}"
+            "beyond", layout.BEYOND.dtype, samples, f"light behind the vertices {in_flight}", True
         ),
-        BufferSpec("vertices", layout.CELL_VERTEX.dtype, samples, f"vertices {in_flight}"),
-        BufferSpec("cell_keys", uint32, context.ring * slots, "fingerprints of cells"),
-        BufferSpec("cells", cell, context.ring * slots, "sums of cells"),
+        BufferSpec("vertices", layout.CELL_VERTEX.dtype, samples, f"vertices {in_flight}", True),
+        BufferSpec("cell_keys", uint32, context.ring * slots, "fingerprints of cells", True),
+        BufferSpec("cells", cell, context.ring * slots, "sums of cells", True),
         BufferSpec(
             "full_buckets",
             uint32,
             context.ring * buckets_of(slots),
             "parts of tables that are full",
+            passing=True,
         ),
     )
     sample_bytes = layout.BEYOND.dtype.itemsize + layout.CELL_VERTEX.dtype.itemsize

@@ -44,7 +44,9 @@ def plan(context: Context) -> StageSpec:
         buffers.append(BufferSpec("film_half", dtype, context.pixel_count, what))
     if context.statistics:
         kernels.append(KernelSpec("count_depths", reads=("status",), record_bytes=8, lanes=False))
-        buffers.append(BufferSpec("census", np.dtype(np.uint32), CENSUS_BINS, "paths by depth"))
+        buffers.append(
+            BufferSpec("census", np.dtype(np.uint32), CENSUS_BINS, "paths by depth", True)
+        )
     return StageSpec(
         "film",
         "samples are summed pass by pass",

@@ -19,6 +19,7 @@ def plan(context: Context) -> StageSpec:
                 np.dtype(np.float32),
                 count,
                 "albedo, normal and depth of passes in flight",
+                passing=True,
             )
         )
     return StageSpec(

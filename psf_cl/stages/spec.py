@@ -14,12 +14,18 @@ from psf_cl.traits import DeviceTraits
 
 @dataclass(frozen=True)
 class BufferSpec:
-    """A buffer of the plan: ``count`` items of ``dtype``; ``what`` says what it holds."""
+    """A buffer of the plan: ``count`` items of ``dtype``; ``what`` says what it holds.
+
+    Attributes:
+        passing: it holds what is on its way, which nobody misses once whole passes are done: all
+            other buffers of stages go into checkpoints.
+    """
 
     name: str
     dtype: np.dtype[Any]
     count: int
     what: str
+    passing: bool = False
 
     @property
     def bytes(self) -> int:
