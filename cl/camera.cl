@@ -172,9 +172,14 @@ static inline uint regenerate(
         Vec3 origin = vec3_of(params->camera_origin);
         const Vec3 right = vec3_of(params->camera_right);
         const Vec3 up = vec3_of(params->camera_up);
+#if LENS == 2
+        Vec3 direction = vec3_of(params->camera_forward);
+        origin = add_scaled(add_scaled(origin, right, film_x), up, film_y);
+#else
         Vec3 direction =
             add_scaled(add_scaled(vec3_of(params->camera_forward), right, film_x), up, film_y);
-#if LENS
+#endif
+#if LENS == 1
         // The point that is sharp stays where it is; the origin moves over the lens (Shirley's map).
         sample_pair(seed, index, (UInt)(PAIR_LENS), params->sampler, &u1, &u2);
         Float c;

@@ -248,7 +248,6 @@ def _few(triangles: int, corners: int, traits: DeviceTraits) -> Feature:
 def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict[str, Feature]:
     shapes = visible_shapes(scene)
     materials = [scene.materials[i] for i in sorted({shape.material for shape in shapes})]
-    camera_lens = bool(scene.cameras) and scene.cameras[scene.camera].lens_radius > 0.0
     lights = [light for light in scene.lights if shines(light)]
     sky = has_environment(scene.environment)
     image = scene.environment.image is not None
@@ -321,7 +320,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             else "the environment is black",
         ),
         "CONNECT": _connect(settings, any(emits(m) for m in materials) or sky, bool(lights)),
-        "LENS": switch(camera_lens, "the camera has a lens", "the camera is a pinhole"),
+        "LENS": _lens(scene),
         "AOV_DIRECT": switch(
             bool(outputs & {"direct", "indirect"}),
             "direct or indirect was asked for",
@@ -334,6 +333,16 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
         ),
         "CELLS": _cells(settings, glossy),
     }
+
+
+def _lens(scene: Scene) -> Feature:
+    """Return how rays leave the camera."""
+    camera = scene.cameras[scene.camera] if scene.cameras else None
+    if camera is not None and camera.height > 0.0:
+        return Feature(2, "the camera is orthographic")
+    if camera is not None and camera.lens_radius > 0.0:
+        return Feature(1, "the camera has a lens")
+    return Feature(0, "the camera is a pinhole")
 
 
 def _cells(settings: Settings, glossy: bool) -> Feature:

@@ -584,7 +584,7 @@ def pixel_order(width: int, height: int) -> np.ndarray:
 def camera_values(camera: Camera, width: int, height: int) -> dict[str, object]:
     """Return the camera's fields of layout.PARAMS."""
     matrix = camera.transform
-    scale_y = math.tan(camera.fov_y / 2)
+    scale_y = camera.height / 2 or math.tan(camera.fov_y / 2)
     if not (np.isfinite(matrix).all() and math.isfinite(scale_y) and scale_y > 0):
         raise InputError(
             f"camera {camera.name!r}: expected a finite position and a field of view below 180"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import copy
+import dataclasses
 import io
 import json
 import math
@@ -22,7 +23,9 @@ import pytest
 from PIL import Image
 
 from psf_cl.errors import InputError
+from psf_cl.scene import gltf_draco
 from psf_cl.scene.gltf import load_gltf
+from psf_cl.scene.gltf_material import film_reflectance
 from psf_cl.scene.model import Scene
 
 # A reader that warns has computed with something that it should have sorted out before.
@@ -224,8 +227,8 @@ def test_versions_that_a_reader_of_2_0_may_read(
 def test_an_unknown_required_extension_is_refused_with_what_is_known(
     builder: Builder, tmp_path: Path
 ) -> None:
-    builder.root["extensionsRequired"] = ["KHR_lights_punctual", "KHR_draco_mesh_compression"]
-    with pytest.raises(InputError, match=r"KHR_mesh_quantization.*'KHR_draco_mesh"):
+    builder.root["extensionsRequired"] = ["KHR_lights_punctual", "EXT_meshopt_compression"]
+    with pytest.raises(InputError, match=r"KHR_mesh_quantization.*'EXT_meshopt_com"):
         builder.load(tmp_path)
     builder.root["extensionsRequired"].pop()
     builder.load(tmp_path)
@@ -380,6 +383,54 @@ def test_nodes_that_share_a_mesh_share_its_arrays(builder: Builder, tmp_path: Pa
     assert (left.name, right.name) == ("left", "right")
 
 
+def compressed_quad(builder: Builder) -> bytearray:
+    """Add a node of a quad that is there in Draco's form alone; return that form."""
+    draco = pytest.importorskip("DracoPy")
+    faces = np.array([[0, 1, 2], [2, 1, 3]], np.uint32)
+    data = draco.encode(np.array(QUAD, np.float32), faces, quantization_bits=14)
+    ids = [part["unique_id"] for part in draco.decode(data).attributes]
+    more = {"bufferView": builder.view(data), "attributes": {"POSITION": ids[0]}}
+    counts = {"POSITION": (4, "VEC3", 5126), "indices": (6, "SCALAR", 5123)}
+    position, indices = (
+        builder.add("accessors", count=count, type=kind, componentType=component)
+        for count, kind, component in counts.values()
+    )
+    primitive = {"attributes": {"POSITION": position}, "indices": indices}
+    primitive["extensions"] = {"KHR_draco_mesh_compression": more}
+    builder.node(mesh=builder.add("meshes", primitives=[primitive]))
+    builder.root["extensionsRequired"] = ["KHR_draco_mesh_compression"]
+    return builder.binary
+
+
+def test_compressed_meshes_are_decoded(builder: Builder, tmp_path: Path) -> None:
+    compressed_quad(builder)
+    scene = builder.load(tmp_path)
+    mesh = scene.shapes[0].mesh
+    corners = {tuple(np.round(corner, 3)) for corner in mesh.positions.tolist()}
+    assert corners == {tuple(map(float, corner)) for corner in QUAD}
+    assert len(mesh.triangles) == 2 and not scene.notes
+    builder.root["accessors"][0]["count"] = 5
+    with pytest.raises(InputError, match=r"POSITION: expected as much compressed data"):
+        builder.load(tmp_path)
+
+
+def test_broken_compressed_data_is_one_error(builder: Builder, tmp_path: Path) -> None:
+    binary = compressed_quad(builder)
+    binary[:] = bytes(len(binary))
+    with pytest.raises(InputError, match=r"draco_mesh_compression.bufferView: expected sound Dr"):
+        builder.load(tmp_path)
+
+
+def test_compressed_meshes_are_refused_without_the_package(
+    builder: Builder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    builder.node(mesh=builder.mesh())
+    builder.root["extensionsRequired"] = ["KHR_draco_mesh_compression"]
+    monkeypatch.setattr(gltf_draco, "is_available", lambda: False)
+    with pytest.raises(InputError, match=r"extensionsRequired: expected the extra draco"):
+        builder.load(tmp_path)
+
+
 # Nodes
 
 
@@ -445,6 +496,66 @@ def test_the_default_scene_is_the_one_drawn(builder: Builder, tmp_path: Path) ->
     assert names() == ["c", "b"]
     del builder.root["scene"], builder.root["scenes"]
     assert names() == ["a", "b", "c"]
+
+
+def test_a_node_that_is_not_visible_hides_all_below_it(builder: Builder, tmp_path: Path) -> None:
+    mesh = builder.mesh()
+    below = builder.add("nodes", mesh=mesh, name="below")
+    for name, visible in (("hidden", {"visible": False}), ("shown", {"visible": True})):
+        builder.node(mesh=mesh, name=name, extensions={"KHR_node_visibility": visible})
+    builder.root["nodes"][builder.root["scenes"][0]["nodes"][0]]["children"] = [below]
+    assert [shape.name for shape in builder.load(tmp_path).shapes] == ["shown"]
+
+
+def instanced(builder: Builder, **attributes: Any) -> int:
+    """Add a node of one triangle, 2 above the ground, at several places."""
+    extension = {"EXT_mesh_gpu_instancing": {"attributes": attributes}}
+    return builder.node(mesh=builder.mesh(), translation=[0, 2, 0], extensions=extension)
+
+
+def test_instances_are_placed_before_their_node(builder: Builder, tmp_path: Path) -> None:
+    instanced(
+        builder,
+        TRANSLATION=builder.accessor([[0, 0, 0], [5, 0, 0]]),
+        ROTATION=builder.accessor([[0, 0, 0, 127], [0, 0, 90, 90]], "i1", normalized=True),
+        SCALE=builder.accessor([[1, 1, 1], [2, 3, 4]]),
+    )
+    shapes = builder.load(tmp_path).shapes
+    assert len(shapes) == 2 and shapes[0].mesh is shapes[1].mesh
+    np.testing.assert_allclose(shapes[0].transform @ [0, 0, 0, 1], [0, 2, 0, 1])
+    # Scaled by (2, 3, 4), turned a quarter about Z: x becomes y.  Bytes round only the length.
+    np.testing.assert_allclose(shapes[1].transform @ [1, 0, 0, 1], [5, 4, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(shapes[1].transform @ [0, 1, 0, 1], [2, 2, 0, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "expected"),
+    [
+        ({}, "of one count"),
+        ({"TRANSLATION": [[0, 0, 0]] * 2, "SCALE": [[1, 1, 1]]}, "of one count"),
+        ({"ROTATION": [[0, 0, 0, 0]]}, "finite transforms"),
+        ({"TRANSLATION": [[np.inf, 0, 0]]}, "finite transforms"),
+    ],
+)
+def test_instances_without_sound_places_are_refused(
+    builder: Builder, tmp_path: Path, attributes: dict[str, Any], expected: str
+) -> None:
+    instanced(builder, **{key: builder.accessor(value) for key, value in attributes.items()})
+    with pytest.raises(InputError, match=rf"nodes\[0\].*attributes: .*{expected}"):
+        builder.load(tmp_path)
+
+
+def test_primitives_that_differ_in_material_alone_share_a_mesh(
+    builder: Builder, tmp_path: Path
+) -> None:
+    builder.mesh()
+    primitive = builder.root["meshes"][0]["primitives"][0]
+    colors = [builder.add("materials", name=name) for name in ("red", "blue")]
+    builder.root["meshes"] = [{"primitives": [{**primitive, "material": m}]} for m in colors]
+    for mesh in range(2):
+        builder.node(mesh=mesh)
+    first, second = builder.load(tmp_path).shapes
+    assert first.mesh is second.mesh and first.material != second.material
 
 
 def test_a_skinned_mesh_stands_in_its_bind_pose(builder: Builder, tmp_path: Path) -> None:
@@ -521,11 +632,15 @@ def test_what_is_not_rendered_is_said(tmp_path: Path) -> None:
         occlusionTexture={"index": 0},
         extensions={
             "KHR_materials_clearcoat": {"clearcoatNormalTexture": {"index": 0}},
-            "KHR_materials_iridescence": {},
+            "KHR_materials_new": {},
+            "KHR_materials_iridescence": {"iridescenceFactor": 1.0},
+            "KHR_materials_dispersion": {"dispersion": 0.5},
+            "KHR_materials_diffuse_transmission": {"diffuseTransmissionFactor": 0.5},
         },
     ).load(tmp_path)
     said = " ".join(scene.notes)
-    for name in ("occlusionTexture", "clearcoatNormalTexture", "KHR_materials_iridescence"):
+    ignored = ("occlusionTexture", "clearcoatNormalTexture", "KHR_materials_new", "dispersion")
+    for name in (*ignored, "iridescence is approx", "diffuse transmission is approx"):
         assert name in said
 
 
@@ -564,6 +679,64 @@ def test_every_extension_of_materials_is_read(tmp_path: Path) -> None:
     }
     assert {name: getattr(material, name) for name in expected} == expected
     assert not scene.notes
+
+
+def metallic_of(material: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the diffuse and the specular colour of a metallic material."""
+    base, m = np.array(material.base_color), material.metallic
+    return base * (1 - m), 0.04 * (1 - m) + base * m
+
+
+@pytest.mark.parametrize(
+    ("diffuse", "specular"),
+    [
+        ((0.5, 0.2, 0.1), (0.04, 0.04, 0.04)),
+        ((0.0, 0.0, 0.0), (0.9, 0.6, 0.3)),
+        ((0.8, 0.8, 0.8), (0.0, 0.0, 0.0)),
+        ((0.3, 0.3, 0.3), (0.5, 0.5, 0.5)),
+    ],
+)
+@pytest.mark.parametrize("textured", [False, True])
+def test_specular_glossiness_keeps_both_colours(
+    tmp_path: Path, diffuse: tuple[float, ...], specular: tuple[float, ...], textured: bool
+) -> None:
+    values: dict[str, Any] = {
+        "diffuseFactor": [*diffuse, 0.5],
+        "specularFactor": list(specular),
+        "glossinessFactor": 0.75,
+    }
+    if textured:
+        values["specularGlossinessTexture"] = {"index": 0}
+    builder = with_material(extensions={"KHR_materials_pbrSpecularGlossiness": values})
+    builder.add("textures", source=builder.add("images", bufferView=0))
+    builder.root["images"][0]["bufferView"] = builder.view(png((255, 255, 255, 128), (2, 1)))
+    builder.root["images"][0]["mimeType"] = "image/png"
+    scene = builder.load(tmp_path)
+    material = scene.materials[0]
+    roughness = material.roughness
+    if textured:
+        code = scene.textures[material.base_color_texture].pixels[0, 1, :3] / 255.0
+        base = np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+        roughness, metallic = (
+            scene.textures[material.metallic_roughness_texture].pixels[0, 1, 1:3] / 255.0
+        )
+        material = dataclasses.replace(material, base_color=tuple(base), metallic=metallic)
+    assert roughness == pytest.approx(1 - 0.75 * 128 / 255 if textured else 0.25, abs=0.003)
+    assert material.alpha == 0.5
+    found_diffuse, found_specular = metallic_of(material)
+    albedo = np.array(diffuse) * (1 - max(specular)) / 0.96
+    np.testing.assert_allclose(found_diffuse, albedo, atol=0.02)
+    np.testing.assert_allclose(found_specular, np.maximum(specular, 0.04), atol=0.02)
+
+
+def test_a_thin_film_reflects_what_its_waves_add_up_to() -> None:
+    # No film, or one that is as dense as the surface, changes nothing: 1.5 reflects 4 %.
+    glass = np.full(3, 0.04)
+    np.testing.assert_allclose(film_reflectance(glass, 1.0, 500.0), glass, rtol=1e-5)
+    np.testing.assert_allclose(film_reflectance(glass, 1.5, 500.0), glass, rtol=1e-5)
+    # A quarter of a wave of the root of the index takes the reflection away.
+    coated = film_reflectance(glass, math.sqrt(1.5), 549.0 / 4 / math.sqrt(1.5))
+    assert coated[1] < 1e-6 < coated[0]
 
 
 def test_glass_without_a_thickness_is_a_thin_wall(tmp_path: Path) -> None:
@@ -703,15 +876,12 @@ def test_cameras_are_placed_without_scale_and_named_once(builder: Builder, tmp_p
     half = math.sqrt(0.5)
     lens = {"yfov": 0.8, "aspectRatio": 1.5, "znear": 0.1}
     wide = builder.add("cameras", type="perspective", perspective=lens, name="wide")
-    flat = builder.add("cameras", type="orthographic", orthographic={})
     turned = {"rotation": [0, half, 0, half], "scale": [3, 3, 3], "translation": [1, 2, 3]}
-    builder.node(camera=flat)
     builder.node(camera=wide, **turned)
     builder.node(camera=wide, name="door")
     builder.node(camera=wide, name="wide")
     scene = builder.load(tmp_path)
     assert [camera.name for camera in scene.cameras] == ["wide", "door", "wide-2"]
-    assert any("orthographic" in note for note in scene.notes)
     assert (scene.width, scene.height) == (768, 512)
     first = scene.cameras[0]
     assert first.fov_y == 0.8
@@ -719,6 +889,16 @@ def test_cameras_are_placed_without_scale_and_named_once(builder: Builder, tmp_p
     np.testing.assert_allclose(first.transform @ [0, 0, -1, 0], [-1, 0, 0, 0], atol=1e-12)
     np.testing.assert_allclose(first.transform[:3, 3], [1, 2, 3])
     np.testing.assert_allclose(first.transform[:3, :3].T @ first.transform[:3, :3], np.eye(3))
+
+
+def test_an_orthographic_camera_has_a_height(builder: Builder, tmp_path: Path) -> None:
+    lens = {"xmag": 3.0, "ymag": -1.5, "zfar": 10.0, "znear": 0.1}
+    builder.node(camera=builder.add("cameras", type="orthographic", orthographic=lens))
+    scene = builder.load(tmp_path)
+    assert (scene.cameras[0].height, scene.width, scene.height) == (3.0, 1024, 512)
+    lens["xmag"] = 0
+    with pytest.raises(InputError, match=r"cameras\[0\].orthographic.xmag: .*other than 0"):
+        builder.load(tmp_path)
 
 
 @pytest.mark.parametrize(("aspect", "width"), [(1e30, 4096), (1e-6, 1), (None, 512), (1.7777, 910)])

@@ -475,6 +475,17 @@ def test_small_light_out_of_focus_becomes_its_circle_of_confusion(device, distan
     assert image.rgb[away < blur - (size + pixel) * np.sqrt(2)].all()
 
 
+def test_parallel_rays_see_everything_in_its_own_size(device):
+    # A film 2 m high and 16 pixels wide and high: the light covers 8 x 8 of them at any distance.
+    for distance in (1.0, 50.0):
+        scene = lens_scene(distance, 0.5, height=2.0)
+        image = render(device, scene, 4, max_depth=0).rgb[..., 0]
+        expected = np.zeros((16, 16))
+        expected[4:12, 4:12] = image.max()
+        assert image.max() > 0
+        np.testing.assert_allclose(image, expected)
+
+
 def test_lens_leaves_what_is_in_focus_sharp(device):
     sharp = render(device, lens_scene(2.0, 0.05), 256, max_depth=0)
     scene = lens_scene(2.0, 0.05, lens_radius=0.3, focus_distance=2.0)

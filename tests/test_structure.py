@@ -33,6 +33,9 @@ ROW_OF = {name: row for row, names in enumerate(ROWS) for name in names}
 # Names of packages on PyPI where they differ from what one imports.
 DISTRIBUTIONS = {"PIL": "Pillow"}
 
+# Packages that only an extra brings.
+EXTRAS = {"DracoPy": "draco"}
+
 KERNEL_FILES = sorted(
     path
     for folder in (kernel_folder(), ROOT / "tests" / "kernels")
@@ -131,7 +134,9 @@ def test_setup_lists_every_package_and_dependency():
         re.match(r"[\w-]+", line)[0]
         for line in config["options"]["install_requires"].strip().splitlines()
     }
-    assert {DISTRIBUTIONS.get(name, name) for name in imported} == required
+    assert {DISTRIBUTIONS.get(name, name) for name in imported - set(EXTRAS)} == required
+    for name, extra in EXTRAS.items():
+        assert name in imported and name in config["options.extras_require"][extra]
 
 
 @pytest.mark.parametrize("path", KERNEL_FILES, ids=lambda path: path.name)

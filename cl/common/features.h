@@ -41,7 +41,7 @@
 #error "CONNECT must be 0 or 1"
 #endif
 #ifndef LENS
-#error "LENS must be 0 or 1"
+#error "LENS must be 0 (a pinhole), 1 (a lens) or 2 (parallel rays)"
 #endif
 #ifndef AOV_DIRECT
 #error "AOV_DIRECT must be 0 or 1"

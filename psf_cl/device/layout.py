@@ -64,9 +64,9 @@ PARAMS = Record(
     float camera_right[3] - unit, world
     float focus_distance - m
     float camera_up[3] - unit, world
-    float film_scale_x - tangent of half the horizontal field of view
+    float film_scale_x - tangent of half the field of view; of parallel rays, m
     float camera_forward[3] - unit, world
-    float film_scale_y - tangent of half the vertical field of view
+    float film_scale_y - the same upwards
     uint width - pixels of the whole film
     uint height - pixels of the whole film
     uint pixel_count - pixels that are rendered

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from psf_cl.errors import InputError
+from psf_cl.scene import gltf_draco
 from psf_cl.scene.gltf_file import (
     FLOAT,
     QUANTISED_OR_FLOAT,
@@ -36,22 +37,29 @@ from psf_cl.scene.model import (
     Scene,
     Shape,
 )
-from psf_cl.scene.transform import rotation_quaternion, without_scale
+from psf_cl.scene.transform import rotation_matrices, rotation_quaternion, without_scale
 
 # A file may list these as required; anything else required is refused.
 SUPPORTED = (
+    "EXT_mesh_gpu_instancing",
     "EXT_texture_webp",
     "KHR_lights_punctual",
     "KHR_materials_anisotropy",
     "KHR_materials_clearcoat",
+    "KHR_materials_diffuse_transmission",
+    "KHR_materials_dispersion",
     "KHR_materials_emissive_strength",
     "KHR_materials_ior",
+    "KHR_materials_iridescence",
+    "KHR_materials_pbrSpecularGlossiness",
     "KHR_materials_sheen",
     "KHR_materials_specular",
     "KHR_materials_transmission",
     "KHR_materials_unlit",
     "KHR_materials_volume",
+    "KHR_materials_variants",
     "KHR_mesh_quantization",
+    "KHR_node_visibility",
     "KHR_texture_transform",
 )
 
@@ -60,6 +68,9 @@ MAX_SHAPES = 1 << 20
 MAX_WIDTH = 4096
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+
+# What of a primitive makes its mesh.
+_GEOMETRY = ("attributes", "indices", "mode", "targets", "extensions")
 
 
 def load_gltf(path: Path) -> Scene:
@@ -89,6 +100,7 @@ class _Reader:
     lights: list[Light] = field(default_factory=list)
     shapes: list[Shape] = field(default_factory=list)
     meshes: dict[int, list[tuple[Mesh, int | None]]] = field(default_factory=dict)
+    primitives: dict[str, Mesh | None] = field(default_factory=dict)
     aspect: float | None = None
     triangle_count: int = 0
 
@@ -109,7 +121,8 @@ class _Reader:
             self.notes["animations are left out: nodes stay where the file puts them"] += 1
         if not self.shapes:
             self.notes["the default scene has no triangles"] += 1
-        ignored = sorted(self.extensions.difference(SUPPORTED))
+        known = {*SUPPORTED, *([gltf_draco.EXTENSION] if gltf_draco.is_available() else [])}
+        ignored = sorted(self.extensions - known)
         if ignored:
             self.notes[f"extensions are ignored: {', '.join(ignored)}"] += 1
         height = Scene.height
@@ -146,6 +159,9 @@ class _Reader:
         drawn: dict[int, None] = {}
         while pending:
             index = pending.pop()
+            visibility = root.element("nodes", index).extension("KHR_node_visibility")
+            if visibility is not None and not visibility.flag("visible", True):
+                continue
             if index not in drawn:
                 drawn[index] = None
                 pending.extend(reversed(children[index]))
@@ -170,14 +186,20 @@ class _Reader:
 
     def _read_camera(self, camera: Item, node: Item, transform: np.ndarray) -> None:
         kind = camera.text("type")
+        fov_y, height, aspect = Camera.fov_y, 0.0, None
         if kind == "orthographic":
-            self.notes["orthographic cameras are left out"] += 1
-            return
-        if kind != "perspective":
+            lens = camera.item(kind)
+            # Negative magnifications are discouraged, not forbidden (section 5.13.3).
+            x, y = (abs(lens.number(key)) for key in ("xmag", "ymag"))
+            if not (x > 0.0 and y > 0.0):
+                lens.fail("xmag" if y > 0.0 else "ymag", "a number other than 0")
+            height, aspect = 2.0 * y, x / y
+        elif kind == "perspective":
+            lens = camera.item(kind)
+            fov_y = lens.number("yfov", low=1e-6, high=math.pi - 1e-6)
+            aspect = lens.number("aspectRatio", low=1e-6) if "aspectRatio" in lens else None
+        else:
             camera.fail("type", "perspective or orthographic")
-        lens = camera.item("perspective")
-        fov_y = lens.number("yfov", low=1e-6, high=math.pi - 1e-6)
-        aspect = lens.number("aspectRatio", low=1e-6) if "aspectRatio" in lens else None
         try:
             pose = without_scale(transform)
         except ValueError:
@@ -185,7 +207,8 @@ class _Reader:
             return
         if not self.cameras:
             self.aspect = aspect
-        self.cameras.append(Camera(pose, fov_y, self._camera_name(node, camera)))
+        name = self._camera_name(node, camera)
+        self.cameras.append(Camera(pose, fov_y, name, height=height))
 
     def _camera_name(self, node: Item, camera: Item) -> str:
         name = node.text("name", "") or camera.text("name", "") or "camera"
@@ -244,12 +267,16 @@ class _Reader:
         if mesh_index not in self.meshes:
             self.meshes[mesh_index] = self._read_mesh(item)
         name = node.text("name", "") or item.text("name", "") or node.place
-        for mesh, material_index in self.meshes[mesh_index]:
-            if len(self.shapes) == MAX_SHAPES:
-                node.fail("mesh", f"at most {MAX_SHAPES} primitives in all nodes together")
-            self.shapes.append(
-                Shape(name, mesh, transform, self.materials.index_of(material_index))
-            )
+        instancing = node.extension("EXT_mesh_gpu_instancing")
+        places = [transform]
+        if instancing is not None:
+            places = _instances(self.gltf, instancing, transform)
+        meshes = self.meshes[mesh_index]
+        if len(self.shapes) + len(places) * len(meshes) > MAX_SHAPES:
+            node.fail("mesh", f"at most {MAX_SHAPES} primitives in all nodes together")
+        for mesh, material_index in meshes:
+            material = self.materials.index_of(material_index)
+            self.shapes.extend(Shape(name, mesh, place, material) for place in places)
 
     def _read_mesh(self, item: Item) -> list[tuple[Mesh, int | None]]:
         """Return the triangle meshes of all primitives with their material indices in the file."""
@@ -258,16 +285,16 @@ class _Reader:
         for i in range(item.length("primitives")):
             primitive = item.element("primitives", i)
             self.extensions.update(primitive.extension_names())
-            try:
-                mesh = self._read_primitive(primitive, name)
-            except MissingData:
-                self.notes["primitives whose buffer has no data are left out"] += 1
-                continue
+            # Meshes that differ in their materials alone are one.
+            key = repr({key: primitive.values.get(key) for key in _GEOMETRY})
+            if key not in self.primitives:
+                try:
+                    self.primitives[key] = self._read_primitive(primitive, name)
+                except MissingData:
+                    self.notes["primitives whose buffer has no data are left out"] += 1
+                    continue
+            mesh = self.primitives[key]
             if mesh is not None:
-                # Each takes memory, however few bytes of the file many of them share.
-                self.triangle_count += len(mesh.triangles)
-                if self.triangle_count > MAX_TRIANGLES:
-                    primitive.fail("indices", f"at most {MAX_TRIANGLES} triangles in all meshes")
                 meshes.append((mesh, self.gltf.index(primitive, "material", "materials")))
         return meshes
 
@@ -279,6 +306,8 @@ class _Reader:
         if mode < _TRIANGLES:
             self.notes["points and lines are left out"] += 1
             return None
+        if gltf_draco.decode_primitive(self.gltf, primitive):
+            mode = _TRIANGLES
         positions = self.gltf.accessor(attributes, "POSITION", "VEC3", QUANTISED_OR_FLOAT)
         if positions is None:
             self.notes["primitives without POSITION are left out"] += 1
@@ -308,6 +337,10 @@ class _Reader:
         triangles = self._triangles(primitive, mode, len(positions))
         if len(triangles) == 0:
             return None
+        # Each mesh takes memory, however few bytes of the file many of them share.
+        self.triangle_count += len(triangles)
+        if self.triangle_count > MAX_TRIANGLES:
+            primitive.fail("indices", f"at most {MAX_TRIANGLES} triangles in all meshes")
 
         used = np.zeros(len(positions), bool)
         used[triangles] = True
@@ -389,7 +422,11 @@ def _check_version(asset: Item) -> None:
 
 def _check_required(root: Item) -> None:
     for name in root.texts("extensionsRequired"):
-        if name not in SUPPORTED:
+        if name == gltf_draco.EXTENSION:
+            if not gltf_draco.is_available():
+                expected = "the extra draco for compressed meshes: pip install 'psf_cl[draco]'"
+                root.fail("extensionsRequired", expected, name)
+        elif name not in SUPPORTED:
             known = ", ".join(SUPPORTED)
             root.fail("extensionsRequired", f"none but {known}", reprlib.repr(name))
 
@@ -453,6 +490,38 @@ def _local_transform(node: Item) -> np.ndarray:
     if "translation" in node:
         matrix[:3, 3] = node.numbers("translation", (0.0, 0.0, 0.0))
     return matrix
+
+
+def _instances(gltf: GltfFile, instancing: Item, transform: np.ndarray) -> list[np.ndarray]:
+    """Return where EXT_mesh_gpu_instancing puts a mesh, ``(4, 4)`` float64 each."""
+    attributes = instancing.item("attributes")
+    components = (*FLOAT, 5120, 5122)
+    moves, turns, scales = (
+        gltf.accessor(attributes, key, kind, allowed)
+        for key, kind, allowed in (
+            ("TRANSLATION", "VEC3", FLOAT),
+            ("ROTATION", "VEC4", components),
+            ("SCALE", "VEC3", FLOAT),
+        )
+    )
+    counts = {len(values) for values in (moves, turns, scales) if values is not None}
+    if len(counts) != 1:
+        instancing.fail("attributes", "TRANSLATION, ROTATION or SCALE, of one count")
+    (count,) = counts
+    if count > MAX_SHAPES:
+        instancing.fail("attributes", f"at most {MAX_SHAPES} instances", str(count))
+    local = np.tile(np.eye(4), (count, 1, 1))
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        if turns is not None:
+            local[:, :3, :3] = rotation_matrices(turns.astype(float))
+        if scales is not None:
+            local[:, :3, :3] *= scales.astype(float)[:, None, :]
+        if moves is not None:
+            local[:, :3, 3] = moves
+        places = transform @ local
+    if not np.isfinite(places).all():
+        instancing.fail("attributes", "accessors of finite transforms", "one that is not")
+    return list(places)
 
 
 def _assemble_triangles(indices: np.ndarray, mode: int) -> np.ndarray:

@@ -115,9 +115,9 @@ class Item:
             self.fail(key, "a string")
         return _printable(value)
 
-    def flag(self, key: str) -> bool:
-        """Return a boolean, false if absent."""
-        value = self.values.get(key, False)
+    def flag(self, key: str, default: bool = False) -> bool:
+        """Return a boolean."""
+        value = self.values.get(key, default)
         if not isinstance(value, bool):
             self.fail(key, "true or false")
         return value
@@ -183,6 +183,7 @@ class GltfFile:
     files: list[str] = field(default_factory=list)
     _buffers: dict[int, memoryview] = field(default_factory=dict)
     _accessors: dict[tuple[int, bool], np.ndarray] = field(default_factory=dict)
+    _decoded: dict[int, np.ndarray] = field(default_factory=dict)
     _zeros: int = 0
 
     def index(self, owner: Item, key: str, array: str) -> int | None:
@@ -277,12 +278,31 @@ class GltfFile:
             names = ", ".join(str(number) for number in components)
             item.fail("componentType", f"one of {names} for {owner.place}.{key}")
         if (index, as_float) not in self._accessors:
-            stored = self._stored(item, _COMPONENTS[component], _ELEMENTS[element_type])
+            stored = self._decoded.get(index)
+            if stored is None:
+                stored = self._stored(item, _COMPONENTS[component], _ELEMENTS[element_type])
             normalised = item.flag("normalized")
             values = _float(stored, normalised) if as_float else stored.copy()
             values.flags.writeable = False  # several meshes may share it
             self._accessors[index, as_float] = values
         return self._accessors[index, as_float]
+
+    def put(self, owner: Item, key: str, index: int, values: np.ndarray) -> None:
+        """Give accessor ``index``, which ``owner[key]`` names, elements that were decompressed.
+
+        Args:
+            values: ``(count, components)``, converted to what the accessor says that it stores.
+        """
+        item = self.root.element("accessors", index)
+        component = _COMPONENTS.get(item.integer("componentType"))
+        elements = _ELEMENTS.get(item.text("type"), 0)
+        count = item.integer("count", low=1)
+        if component is None or values.shape != (count, elements):
+            got = " x ".join(str(size) for size in values.shape)
+            owner.fail(key, f"as much compressed data as accessors[{index}] says", got)
+        # Overflow on the way to integers is a picture that looks wrong, no error.
+        with np.errstate(all="ignore"):
+            self._decoded[index] = values.astype(component)
 
     def _buffer_data(self, index: int) -> memoryview:
         if index not in self._buffers:

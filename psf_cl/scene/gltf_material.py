@@ -8,13 +8,14 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from psf_cl.scene.gltf_file import GltfFile, Item, MissingData
 from psf_cl.scene.model import MAX_RADIANCE, Material, Texture, limited
+from psf_cl.scene.specular_glossiness import convert_pictures, to_metallic
 from psf_cl.scene.texture import decode_pixels
 from psf_cl.scene.transform import uv_rows
 
@@ -94,7 +95,7 @@ class MaterialReader:
             (volume, "thicknessTexture"),
         )
         normal = item.item("normalTexture")
-        return Material(
+        material = Material(
             item.text("name", "") or item.place,
             base_color=base[:3],
             base_color_texture=self._texture(surface, "baseColorTexture"),
@@ -135,6 +136,94 @@ class MaterialReader:
             emission_texture=self._texture(item, "emissiveTexture") if any(emission) else -1,
             double_sided=item.flag("doubleSided"),
             unlit=item.extension("KHR_materials_unlit") is not None,
+        )
+        return self._with_approximations(item, material)
+
+    def _with_approximations(self, item: Item, material: Material) -> Material:
+        """Return ``material`` with what it has no parameters for put into others, and say so."""
+        glossy = item.extension("KHR_materials_pbrSpecularGlossiness")
+        if glossy is not None:
+            material = self._from_glossiness(glossy, material)
+        film = item.extension("KHR_materials_iridescence")
+        if film is not None:
+            material = self._with_film(film, material)
+        through = item.extension("KHR_materials_diffuse_transmission")
+        share = 0.0 if through is None else through.number("diffuseTransmissionFactor", 0, 0, 1)
+        if share > 0.0 and material.transmission == 0.0:
+            self.notes["diffuse transmission is approximated by a rough sheet"] += 1
+            color = through.numbers("diffuseTransmissionColorFactor", (1.0, 1.0, 1.0), 0.0, 1.0)
+            mixed = (b + (c - b) * share for b, c in zip(material.base_color, color, strict=True))
+            material = replace(
+                material,
+                base_color=tuple(mixed),
+                transmission=share,
+                thin_walled=True,
+                roughness=1.0,
+                metallic_roughness_texture=-1,
+            )
+        dispersion = item.extension("KHR_materials_dispersion")
+        if dispersion is not None and dispersion.number("dispersion", 0.0, 0.0) > 0.0:
+            self.notes["dispersion is left out: glass bends all colours alike"] += 1
+        return material
+
+    def _from_glossiness(self, item: Item, material: Material) -> Material:
+        """Return the metallic material of KHR_materials_pbrSpecularGlossiness."""
+        self.notes["specular-glossiness materials are turned into metallic ones"] += 1
+        diffuse = item.numbers("diffuseFactor", (1.0, 1.0, 1.0, 1.0), 0.0, 1.0)
+        specular = item.numbers("specularFactor", (1.0, 1.0, 1.0), 0.0, 1.0)
+        glossiness = item.number("glossinessFactor", 1.0, 0.0, 1.0)
+        pictures = [
+            self._texture(item, key) for key in ("diffuseTexture", "specularGlossinessTexture")
+        ]
+        if max(pictures) < 0:
+            base, metallic = to_metallic(np.array(diffuse[:3]), np.array(specular))
+            return replace(
+                material,
+                base_color=tuple(base.tolist()),
+                alpha=diffuse[3],
+                metallic=float(metallic),
+                roughness=1.0 - glossiness,
+            )
+        known = [self.textures[index] for index in pictures if index >= 0]
+        white = np.full((1, 1, 4), 255, np.uint8)
+        colors = [self.textures[index].pixels if index >= 0 else white for index in pictures]
+        base_pixels, rough_pixels = convert_pictures(
+            colors[0], np.array(diffuse[:3]), colors[1], np.array([*specular, glossiness])
+        )
+        # Where the two lie otherwise on the surface, that of the diffuse colour holds for both.
+        first = len(self.textures)
+        self.textures += [
+            replace(known[0], pixels=base_pixels),
+            replace(known[0], pixels=rough_pixels, srgb=False),
+        ]
+        return replace(
+            material,
+            base_color=(1.0, 1.0, 1.0),
+            base_color_texture=first,
+            alpha=diffuse[3],
+            metallic=1.0,
+            roughness=1.0,
+            metallic_roughness_texture=first + 1,
+        )
+
+    def _with_film(self, film: Item, material: Material) -> Material:
+        """Return ``material`` in the colour of a thin film as seen from straight above."""
+        strength = film.number("iridescenceFactor", 0.0, 0.0, 1.0)
+        index = film.number("iridescenceIor", 1.3, 1.0)
+        thickness = film.number("iridescenceThicknessMaximum", 400.0, 0.0)
+        if strength == 0.0:
+            return material
+        self.notes["iridescence is approximated: its colour does not change with the angle"] += 1
+        bare = np.full(3, ((material.ior - 1.0) / (material.ior + 1.0)) ** 2)
+        tint = film_reflectance(bare, index, thickness) / np.maximum(bare, 1e-6)
+        tint = 1.0 + (np.minimum(tint, 1.0) - 1.0) * strength
+        metal = film_reflectance(np.array(material.base_color), index, thickness)
+        share = strength * material.metallic
+        base = np.array(material.base_color) * (1.0 - share) + metal * share
+        return replace(
+            material,
+            base_color=tuple(np.clip(base, 0.0, 1.0).tolist()),
+            specular_color=tuple((tint * material.specular_color).tolist()),
         )
 
     def _specular_color(self, specular: Item) -> tuple[float, ...]:
@@ -223,3 +312,26 @@ def _texture_transform(change: Item) -> tuple[float, ...]:
     offset = change.numbers("offset", (0.0, 0.0))
     scale = change.numbers("scale", (1.0, 1.0))
     return uv_rows(offset, change.number("rotation", 0.0), scale)
+
+
+def film_reflectance(bare: np.ndarray, index: float, thickness: float) -> np.ndarray:
+    """Return what a surface under a thin film in air reflects of light along its normal, ``(3,)``.
+
+    Args:
+        bare: ``(3,)``, what the surface reflects without a film.
+        index: of refraction, of the film.
+        thickness: nm.
+
+    Source: Airy's sum of the light that goes back and forth in the film (Born, Wolf, "Principles of
+    Optics", section 7.6.1), at the main wavelengths of the Rec.709 primaries.  Only the reflectance
+    of the surface is known: its amplitude is taken as if it were denser than the film.
+    """
+    wavelengths = np.array([611.0, 549.0, 464.0])
+    top = (1.0 - index) / (1.0 + index)
+    root = np.sqrt(np.clip(bare, 0.0, 0.9999))
+    # The index of the surface in air, and from it the amplitude below the film.
+    below_index = (1.0 + root) / (1.0 - root)
+    below = (index - below_index) / (index + below_index)
+    phase = np.cos(4.0 * np.pi * index * thickness / wavelengths)
+    both = top * top + below * below + 2.0 * top * below * phase
+    return both / (1.0 + top * top * below * below + 2.0 * top * below * phase)

@@ -212,20 +212,23 @@ class Environment:
 
 @dataclass(frozen=True)
 class Camera:
-    """A perspective camera; it looks along its local -Z, its local +Y is up.
+    """A perspective or orthographic camera; it looks along its local -Z, its local +Y is up.
 
     Attributes:
         transform: ``(4, 4)`` float64, camera to world, rotation and translation only.
         fov_y: vertical field of view, radians.
         lens_radius: meters; 0 is a pinhole.
         focus_distance: meters along the view direction that are sharp; used if lens_radius > 0.
+        height: meters from the bottom of the film to its top if rays are parallel, which start in
+            the camera's plane and know no lens; 0 if they start in a point.
     """
 
     transform: np.ndarray
-    fov_y: float
+    fov_y: float = 0.7853981633974483
     name: str = ""
     lens_radius: float = 0.0
     focus_distance: float = 1.0
+    height: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -44,15 +44,25 @@ def rotation_quaternion(quaternion: Vector) -> np.ndarray:
     Raises:
         ValueError: the quaternion is zero or not finite.
     """
-    x, y, z, w = _unit(np.asarray(quaternion, float), "quaternion")
-    return _affine(
-        np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+    unit = _unit(np.asarray(quaternion, float), "quaternion")
+    return _affine(_rotation(*unit))
+
+
+def rotation_matrices(quaternions: np.ndarray) -> np.ndarray:
+    """Return ``(n, 3, 3)``, the rotations of ``(n, 4)`` quaternions; NaN for zero ones."""
+    unit = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    return np.moveaxis(_rotation(*unit.T), -1, 0)
+
+
+def _rotation(
+    x: np.ndarray | float, y: np.ndarray | float, z: np.ndarray | float, w: np.ndarray | float
+) -> np.ndarray:
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
     )
 
 

@@ -38,20 +38,36 @@ def buckets(pixel_count: int) -> int:
 
 def parameters(scene: Scene, settings: Settings, pixel_count: int) -> dict[str, Any]:
     """Return what the kernels need to know, by the names of ``layout.PARAMS``."""
-    camera = scene.cameras[scene.camera]
-    pixel = 2.0 * math.tan(camera.fov_y / 2.0) / scene.height
     steps = fixed_point(HEADROOM * brightest(scene), pixel_count)
     return {
         "cell_slots": slots_of(pixel_count),
         "cell_flags": layout.CONSTANT["CELL_JITTER"] * settings.cell_jitter
         + layout.CONSTANT["CELL_NEAR"] * settings.cell_near,
-        "cell_width": settings.cell_size * pixel,
+        "cell_width": settings.cell_size * pixel_per_meter(scene),
         "cell_shrink": SHRINK_EXPONENT if settings.cell_shrink else 0.0,
         "cell_steps": steps,
         "cell_limit": 2.0**SUM_BITS / steps / slots_for(pixel_count),
         "filter_vertex": _vertex(settings),
         "filter_direct": int(settings.filter_direct),
     }
+
+
+def pixel_per_meter(scene: Scene) -> float:
+    """Return how wide a pixel is for each meter of the way from the camera.
+
+    Parallel rays see pixels of one width: it is right in the middle of the scene.
+    """
+    camera = scene.cameras[scene.camera]
+    if camera.height == 0.0:
+        return 2.0 * math.tan(camera.fov_y / 2.0) / scene.height
+    places = [
+        shape.transform[:3, :3] @ shape.mesh.positions[0] + shape.transform[:3, 3]
+        for shape in scene.shapes
+    ]
+    away = np.asarray(places).reshape(-1, 3) - camera.transform[:3, 3]
+    distances = -away @ camera.transform[:3, 2]
+    known = distances[np.isfinite(distances) & (distances > 0.0)]
+    return camera.height / scene.height / (float(known.mean()) if len(known) else camera.height)
 
 
 def _vertex(settings: Settings) -> int:
