@@ -48,7 +48,7 @@ static inline CellSamples load_cell_samples(
     s.query.seen = (vertex & VERTEX_MASK) == 1u;
     s.query.near = params->cell_flags & CELL_NEAR ? vertex >> 31 : (UInt)(0u);
     s.query.extra = params->cell_flags & CELL_IDENTITY ? s.pixel + 1u : (UInt)(0u);
-    const float shrunk = params->cell_width * exp2(params->cell_shrink * log2((float)(pass + 1u)));
+    const float shrunk = params->cell_width * exp2(params->cell_shrink * log2((float)(pass - params->first_pass + 1u)));
     s.query.width = GATHER(vertices, s.pixel, length) * shrunk;
     s.there = inside & (vertex != 0u);
 
@@ -257,8 +257,9 @@ kernel void add_unfiltered(
     const uint pixel = get_global_id(0);
     if (pixel >= params->pixel_count)
         return;
-    if (vload4(pixel, samples).w <= 0.0f || beyond[pixel].vertex == 0u)
+    const ulong at = (ulong)(params->first_pass & (params->ring - 1u)) * params->pixel_count + pixel;
+    if (vload4(at, samples).w <= 0.0f || beyond[at].vertex == 0u)
         return;
     for (uint c = 0; c < 3; ++c)
-        film[pixel].sum[c] += beyond[pixel].radiance[c];
+        film[pixel].sum[c] += beyond[at].radiance[c];
 }

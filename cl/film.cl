@@ -90,7 +90,7 @@ kernel void add_half(
         for (uint k = 0; k < passes; ++k) {
             const uint pass = counters[COUNTER_FILM_PASS] + k;
             const ulong at = (ulong)(pass & (params->ring - 1u)) * params->pixel_count + pixel;
-            if (pass_is_in_half(pass))
+            if (pass_is_in_half(pass - params->first_pass))
                 add_sample(&sum, vload4(at, samples));
         }
         film_half[pixel] = sum;

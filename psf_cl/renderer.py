@@ -160,6 +160,50 @@ class Renderer:
     def _between(self, start: int) -> None:
         """Do what the paths of an epoch need that begins with pass ``start``."""
 
+    # Frames.
+
+    def set_frame(self, time: float) -> None:
+        """Begin the frame at ``time``, seconds: an empty film, and everything where it is then.
+
+        Random numbers go on where the frame before ended, so that frames of a still scene differ as
+        passes do.  Counts and times begin anew.
+
+        Raises:
+            InputError: something has no place at that time.
+        """
+        self.device.wait()
+        # Of the device: after an interrupt the host has not seen its last passes.
+        first = int(self.device.read(self.buffers["counters"])[layout.COUNTER_INDEX["film_pass"]])
+        self.scheduler.begin_frame(first)
+        self.scheduler.clock.start()
+        try:
+            self._empty(first)
+            values = tables.camera_values(
+                self.scene.cameras[self.scene.camera], self.scene.width, self.scene.height
+            )
+            before = self.params[0].copy()
+            values |= {new: before[name] for new, name in tables.PREVIOUS_CAMERA.items()}
+            self._set_params(values | {"first_pass": first})
+            self.device.wait()
+        finally:
+            self.scheduler.clock.stop()
+
+    def _empty(self, first: int) -> None:
+        """Leave no path in the pool and no sample in the film; ``first`` is the next pass."""
+        counters = np.zeros(self.buffers["counters"].count, np.uint32)
+        for name in ("next_pass", "film_pass", "pass_limit"):
+            counters[layout.COUNTER_INDEX[name]] = first
+        self.device.write(self.buffers["counters"], counters)
+        names = (name for ring, sums, _ in film.PLANES for name in (ring, sums))
+        for name in ("pool", "film_half", *names):
+            if name in self.buffers:
+                self.device.fill(self.buffers[name])
+
+    def _set_params(self, values: dict[str, Any]) -> None:
+        for name, value in values.items():
+            self.params[0][name] = value
+        self.device.write(self.buffers["params"], self.params)
+
     # Rendering.
 
     def step(self) -> None:
@@ -255,7 +299,7 @@ class Renderer:
         x, y, width, height = self.plan.crop
         # Of the device: after an interrupt the host has not seen its last passes.
         counters = self.device.read(self.buffers["counters"], layout.COUNTER_INDEX["finished"])
-        partial = counters[layout.COUNTER_INDEX["film_pass"]] == 0
+        partial = counters[layout.COUNTER_INDEX["film_pass"]] == self.scheduler.first
         order = self.order
         sums: dict[str, np.ndarray] = {}
         for ring, name, planes in film.PLANES:
@@ -392,7 +436,7 @@ class Renderer:
     def stats(self) -> dict[str, Any]:
         """Return what ``--stats`` writes, without errors against a reference."""
         counters = self.device.read(self.buffers["counters"], layout.COUNTER_INDEX["finished"])
-        passes = int(counters[layout.COUNTER_INDEX["film_pass"]])
+        passes = int(counters[layout.COUNTER_INDEX["film_pass"]]) - self.scheduler.first
         rays = {kind: layout.rays_so_far(counters, kind) for kind in layout.RAY_KINDS}
         stages = [{"name": name} | asdict(spent) for name, spent in self.device.totals.items()]
         return {
@@ -493,12 +537,13 @@ class Renderer:
         if self.plan.features["FEW"].value:
             few = tables.few_triangles(geometry.positions, geometry.cut_out)
         self.dropped_triangles = few.dropped if few else 0
+        self.params = self._params(geometry, few, len(lights), environment_pmf)
 
         def or_zeros(table: np.ndarray | None, record: layout.Record) -> np.ndarray:
             return np.zeros(geometry.count, record.dtype) if table is None else table
 
         contents = {
-            "params": lambda: self._params(geometry, few, len(lights), environment_pmf),
+            "params": lambda: self.params,
             "corners": lambda: few.corners.reshape(-1),
             "faces": lambda: few.faces.reshape(-1),
             "surfaces": lambda: geometry.surfaces,
@@ -562,6 +607,8 @@ class Renderer:
             "direct_sampling": layout.CONSTANT[f"DIRECT_{settings.direct_sampling.upper()}"],
             "sampler": layout.CONSTANT[f"SAMPLER_{settings.sampler.upper()}"],
         }
+        # There is no frame before the first: nothing has moved.
+        values |= {new: values[name] for new, name in tables.PREVIOUS_CAMERA.items()}
         values |= cells.parameters(scene, settings, self.plan.pixel_count)
         for name, value in values.items():
             params[0][name] = value

@@ -98,7 +98,8 @@ class Scheduler:
             done between passes, so that the pool never needs to drain.
 
     Attributes:
-        passes: whole passes that the film holds.
+        first: the first pass of this frame; passes are counted on from frame to frame.
+        passes: whole passes that the film holds, those of this frame.
         rays: traced until the last look at the counters, by kind.
         clock: seconds spent in ``run``.
         stop: first pass that may not start.
@@ -110,14 +111,19 @@ class Scheduler:
         self.hooks = hooks
         self.slots = slots
         self.epoch_end = epoch_end
-        self.epoch = range(0 if epoch_end is not None else MAX_PASSES)
+        self.rays: dict[str, int] = {}
+        self.bounces = 1
+        self.begin_frame()
+
+    def begin_frame(self, first: int = 0) -> None:
+        """Count passes from ``first`` on as those of a new frame; the pool must be empty."""
+        self.first = first
+        self.epoch = range(0 if self.epoch_end is not None else MAX_PASSES)
         self.passes = 0
         self.stop = 0
         self.started = 0
         self.resting = False
-        self.rays: dict[str, int] = {}
         self.clock = Clock()
-        self.bounces = 1
 
     @property
     def at_rest(self) -> bool:
@@ -170,8 +176,8 @@ class Scheduler:
                     if (bounce + 1) % BOUNCES_PER_FILM == 0 or bounce + 1 == self.bounces:
                         self.hooks.film()
                 counters = self.hooks.counters()
-                self.passes = int(counters[COUNTER_INDEX["film_pass"]])
-                self.started = int(counters[COUNTER_INDEX["next_pass"]]) + 1
+                self.passes = int(counters[COUNTER_INDEX["film_pass"]]) - self.first
+                self.started = int(counters[COUNTER_INDEX["next_pass"]]) + 1 - self.first
                 self._look_at_rays(counters)
                 rays = sum(self.rays.values())
                 self._adapt(time.perf_counter() - begin, rays - last_rays)
@@ -197,7 +203,7 @@ class Scheduler:
     def _start(self, limit: int) -> None:
         """Let passes start up to ``limit``, or up to the end of the epoch."""
         if self.epoch_end is not None and self.passes == self.epoch.stop < limit:
-            self.hooks.between(self.passes)
+            self.hooks.between(self.first + self.passes)
             self.epoch = range(self.passes, self.epoch_end(self.passes))
         self._stop_at(min(limit, self.epoch.stop))
 
@@ -211,7 +217,7 @@ class Scheduler:
 
     def _stop_at(self, passes: int) -> None:
         self.stop = passes
-        self.hooks.limit(passes)
+        self.hooks.limit(self.first + passes)
 
     def _look_at_rays(self, counters: np.ndarray) -> None:
         self.rays = {kind: rays_so_far(counters, kind) for kind in RAY_KINDS}

@@ -37,6 +37,17 @@ OFFSET_EPSILON = 2.0**-20
 NEAR_SHARE = 0.5
 
 
+#: The camera of the frame before, in layout.PARAMS, and what it is made of.
+PREVIOUS_CAMERA = {
+    "previous_origin": "camera_origin",
+    "previous_right": "camera_right",
+    "previous_up": "camera_up",
+    "previous_forward": "camera_forward",
+    "previous_scale_x": "film_scale_x",
+    "previous_scale_y": "film_scale_y",
+}
+
+
 @dataclass(frozen=True)
 class Geometry:
     """Every triangle of the scene in world space.

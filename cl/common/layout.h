@@ -163,7 +163,13 @@ typedef struct {
     float cell_limit; // radiance from which a sample is too large for the sums
     uint filter_vertex; // first vertex whose light may be shared; FILTER_AUTO, FILTER_NONE
     uint filter_direct; // whether light that falls on it directly is shared too
-    uint pad[3]; // fills the record
+    uint first_pass; // of this frame; passes are counted on from frame to frame
+    float previous_origin[3]; // of the camera of the frame before; world, m
+    float previous_right[3]; // unit, world
+    float previous_up[3]; // unit, world
+    float previous_forward[3]; // unit, world
+    float previous_scale_x; // tangent of half the horizontal field of view
+    float previous_scale_y; // tangent of half the vertical field of view
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 START = time.perf_counter()
 
 
+#: Frames of one sequence.
+MAX_FRAMES = 100_000
+
+
 class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one line."""
 
@@ -57,6 +61,16 @@ def aov_argument(text: str) -> frozenset[str]:
     """Parse a list of AOV names, or ``all``; ``make_plan`` knows which there are."""
     names = frozenset(part.strip() for part in text.split(","))
     return names - {"all"} | set(AOVS) if "all" in names else names
+
+
+def frames_argument(text: str) -> range:
+    """Parse ``A:B``: the frames from A to B - 1."""
+    numbers = _integers(text, text.split(":"), 2)
+    if numbers is None or not numbers[0] < numbers[1] <= numbers[0] + MAX_FRAMES < 1 << 31:
+        raise argparse.ArgumentTypeError(
+            f"expected A:B, frames A to B - 1, at most {MAX_FRAMES}; got {text!r}"
+        )
+    return range(*numbers)
 
 
 def file_argument(text: str) -> str:
@@ -154,6 +168,19 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
         type=aov_argument,
         default=frozenset(),
         help=f"further channels: {', '.join(AOVS)}; or all",
+    )
+
+
+def add_frame_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what makes a render a sequence."""
+    parser.add_argument(
+        "--frames",
+        metavar="A:B",
+        type=frames_argument,
+        help="render frames A to B - 1, each with the budget; #### in OUT is the frame's number",
+    )
+    parser.add_argument(
+        "--fps", metavar="F", type=positive_number, default=24.0, help="frames a second (24)"
     )
 
 

@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import math
 import os
+import re
 import signal
 import sys
 import threading
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from psf_cl.cli.common import (
     START,
+    add_frame_arguments,
     add_scene_arguments,
     check_distinct,
     exposure_argument,
@@ -68,6 +70,7 @@ def add_parser(commands: Any) -> None:
         type=positive_number,
         help="stop when the relMSE, estimated from the samples, is below E",
     )
+    add_frame_arguments(parser)
     parser.add_argument(
         "--exposure",
         metavar="EV",
@@ -119,8 +122,12 @@ def run(args: argparse.Namespace) -> int:
     from psf_cl.image import json_text, output_paths, write_exr, write_png
     from psf_cl.plan import make_plan
 
-    exr, png = output_paths(args.output or f"{Path(args.scene).stem}.exr")
-    outputs = [exr, png] + [Path(name) for name in (args.stats, args.checkpoint) if name]
+    if args.frames and (args.checkpoint or args.resume):
+        raise InputError("--frames: not with --checkpoint or --resume, which are of one image")
+    frames = args.frames or range(1)
+    paths = [output_paths(_frame_name(args, frame)) for frame in frames]
+    outputs = [path for pair in paths for path in pair]
+    outputs += [Path(name) for name in (args.stats, args.checkpoint) if name]
     for path in outputs:
         check_writable(path)
         remove_leftovers(path)
@@ -157,49 +164,84 @@ def run(args: argparse.Namespace) -> int:
             _resume(renderer, args)
     if not args.quiet:
         tell_notes(renderer.notes)
+    all_stats = []
+    checkpoints = Checkpoints(renderer, args.checkpoint, args.checkpoint_seconds)
     # Until the files are written, Ctrl-C must not throw the picture away.
-    with stop_on_interrupt() as interrupted:
-        with contextlib.closing(renderer):
-            curve = ErrorCurve(reference)
-            checkpoints = Checkpoints(renderer, args.checkpoint, args.checkpoint_seconds)
-            with ProgressDisplay(args.quiet) as display:
-
-                def on_progress(progress: Progress) -> bool:
-                    display.update(progress)
-                    curve.follow(renderer, progress)
-                    checkpoints.follow(progress)
-                    return not interrupted()
-
-                if args.noise:
-                    renderer.render_to(args.noise, on_progress)
-                else:
-                    spp = None if args.seconds else args.spp or DEFAULT_SPP
-                    renderer.render(spp=spp, seconds=args.seconds, progress=on_progress)
-            image = renderer.image()
-            stats = image.stats
-            checkpoints.save(stats["spp"])
-            if args.noise:
-                stats["estimated_relmse"] = renderer.estimated_error()
-            if not stats["spp"] and not renderer.snapshot(("rgb", "samples")).aovs["samples"].any():
-                raise KeyboardInterrupt
-        if reference is not None:
-            if stats["spp"]:
-                curve.add(stats["render_seconds"], stats["spp"], image.rgb)
-            stats["error"] = curve.points
-
-        write_exr(exr, image, args.half)
-        write_png(png, image, args.exposure)
+    with stop_on_interrupt() as interrupted, contextlib.closing(renderer):
+        for frame, (exr, png) in zip(frames, paths, strict=True):
+            if args.frames and frame != frames.start:
+                renderer.set_frame(frame / args.fps)
+            image = _render_frame(args, renderer, reference, checkpoints, interrupted)
+            write_exr(exr, image, args.half)
+            write_png(png, image, args.exposure)
+            all_stats.append(image.stats)
+            if not args.quiet:
+                print(_summary(exr, image))
+            if interrupted():
+                break
         if args.stats:
+            stats = {"frames": all_stats} if args.frames else all_stats[0]
             stats["process_seconds"] = time.perf_counter() - START
             write_whole(args.stats, (json_text(stats, indent=2) + "\n").encode())
         stopped = interrupted()
     if checkpoints.failure is not None:
         raise checkpoints.failure
-    if not args.quiet:
-        print(_summary(exr, image))
     if stopped:
         print("psf-cl: interrupted; what was rendered is written", file=sys.stderr)
     return 130 if stopped else 0
+
+
+def _frame_name(args: argparse.Namespace, frame: int) -> str:
+    """Return the name of the EXR of a frame: its number stands for the name's run of #."""
+    default = Path(args.scene).stem + ("_####" if args.frames else "") + ".exr"
+    name = args.output or default
+    if args.frames is None:
+        return name
+    marks = re.findall("#+", Path(name).name)
+    if len(marks) != 1:
+        raise InputError(f"-o: expected one run of # in the name, for the frame; got {name!r}")
+    number = str(frame).zfill(len(marks[0]))
+    return str(Path(name).with_name(Path(name).name.replace(marks[0], number)))
+
+
+def _render_frame(
+    args: argparse.Namespace,
+    renderer: Renderer,
+    reference: np.ndarray | None,
+    checkpoints: Checkpoints,
+    interrupted: Callable[[], bool],
+) -> Image:
+    """Spend the budget on the frame that the renderer is at; return its image.
+
+    Raises:
+        KeyboardInterrupt: it was interrupted before there was a sample.
+    """
+    curve = ErrorCurve(reference)
+    with ProgressDisplay(args.quiet) as display:
+
+        def on_progress(progress: Progress) -> bool:
+            display.update(progress)
+            curve.follow(renderer, progress)
+            checkpoints.follow(progress)
+            return not interrupted()
+
+        if args.noise:
+            renderer.render_to(args.noise, on_progress)
+        else:
+            spp = None if args.seconds else args.spp or DEFAULT_SPP
+            renderer.render(spp=spp, seconds=args.seconds, progress=on_progress)
+    image = renderer.image()
+    stats = image.stats
+    checkpoints.save(stats["spp"])
+    if args.noise:
+        stats["estimated_relmse"] = renderer.estimated_error()
+    if not stats["spp"] and not renderer.snapshot(("rgb", "samples")).aovs["samples"].any():
+        raise KeyboardInterrupt
+    if reference is not None:
+        if stats["spp"]:
+            curve.add(stats["render_seconds"], stats["spp"], image.rgb)
+        stats["error"] = curve.points
+    return image
 
 
 def open_prepared_device(
