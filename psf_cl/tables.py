@@ -27,6 +27,7 @@ from psf_cl.scene.model import (
     is_invisible,
     shines,
 )
+from psf_cl.scene.texture import decoded_srgb
 
 #: What the rounding error of a point is bounded by, relative to the coordinates it is made of: the
 #: intersection subtracts, shears and divides, about eight roundings of 2^-24.
@@ -338,10 +339,7 @@ def absorption(material: Material) -> np.ndarray:
 
 def srgb_to_linear() -> np.ndarray:
     """Return ``(256,)`` float32: the linear value of each 8-bit sRGB code (IEC 61966-2-1)."""
-    code = np.arange(256) / 255.0
-    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4).astype(
-        np.float32
-    )
+    return decoded_srgb(np.arange(256) / 255.0).astype(np.float32)
 
 
 def texture_tables(

@@ -287,7 +287,11 @@ def test_a_bad_scene_is_one_line(folder, capfd, case):
 
 def test_triangles_are_counted_before_all_meshes_are_made(folder, capfd, monkeypatch):
     monkeypatch.setattr("psf_cl.scene.gltf.MAX_TRIANGLES", 14)
-    (folder / "a.gltf").write_text(zeros_gltf(1, 1000, count=9))
+    document = json.loads(zeros_gltf(1, 1000, count=9))
+    # Equal primitives would share one mesh.
+    for number, primitive in enumerate(document["meshes"][0]["primitives"]):
+        primitive["extensions"] = {"OTHER": {"number": number}}
+    (folder / "a.gltf").write_text(json.dumps(document))
     error = refused(["plan", "a.gltf"], capfd, folder)
     assert "meshes[0].primitives[4].indices: expected at most 14 triangles in all meshes" in error
 

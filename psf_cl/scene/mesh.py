@@ -1,20 +1,18 @@
 """OBJ, PLY and STL files: trimesh reads them, this module checks what it returns.
 
 The format readers of trimesh are called directly: its mesh class would merge and reorder.  It also
-drops what an MTL file says about emission and missing textures, so the MTL is read here; OBJ text
+drops most of what an MTL file says, so ``mtl`` reads it; OBJ text
 is put into the plain form that trimesh's reader expects first.
 """
 
 from __future__ import annotations
 
 import io
-import math
 import os
 import re
 import struct
 import warnings
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +20,9 @@ import numpy as np
 
 from psf_cl.errors import InputError
 from psf_cl.files import read_file
-from psf_cl.scene.model import MAX_RADIANCE, Material, Mesh, Scene, Shape, Texture, limited
-from psf_cl.scene.texture import load_texture
+from psf_cl.scene.model import Material, Mesh, Scene, Shape
+from psf_cl.scene.mtl import MaterialLibrary, Picture
+from psf_cl.scene.texture import decoded_srgb
 
 SUFFIXES = (".obj", ".ply", ".stl")
 
@@ -65,21 +64,20 @@ def _load_ply(path: Path, data: bytes) -> Scene:
     from trimesh.exchange.ply import load_ply
 
     read = _guarded(path, "PLY", lambda: load_ply(io.BytesIO(data), skip_materials=True))
-    textures: list[Texture] = []
-    lost: list[str] = []
+    library = MaterialLibrary(path)
     material = Material()
     # MeshLab's way to name a texture.
     named = re.search(rb"^comment TextureFile (.+?)\s*$", data[:4096], re.MULTILINE)
     if named is not None:
         name = named[1].decode("utf-8", "replace")
-        material = Material(base_color_texture=_texture_index(path, name, textures, lost))
+        material = Material(base_color_texture=library.texture(Picture(name, {})))
     return Scene(
         path=str(path),
         shapes=_shapes(path, [read]),
         materials=(material,),
-        textures=tuple(textures),
-        notes=tuple(f"left out: {reason}" for reason in lost),
-        files=(str(path), *_texture_files(path, textures)),
+        textures=tuple(library.textures),
+        notes=tuple(f"left out: {reason}" for reason in library.lost),
+        files=(str(path), *library.files),
     )
 
 
@@ -151,7 +149,20 @@ def _checked_mesh(path: Path, name: str, part: dict[str, Any]) -> Mesh | None:
         triangles=np.stack(fan, axis=1).reshape(-1, 3).astype(np.uint32),
         normals=_unit_normals(part.get("vertex_normals"), len(positions)),
         uvs=uvs,
+        colors=_linear_colors(part.get("vertex_colors"), len(positions)),
     )
+
+
+def _linear_colors(colors: Any, count: int) -> np.ndarray | None:
+    """Return linear RGBA in [0, 1] of sRGB colours, bytes or floats; None unless all have one."""
+    colors = None if colors is None else np.asarray(colors)
+    if colors is None or colors.ndim != 2 or len(colors) != count or colors.shape[1] not in (3, 4):
+        return None
+    scale = 255.0 if colors.dtype.kind in "iu" else 1.0
+    values = np.ones((count, 4), np.float32)
+    values[:, : colors.shape[1]] = np.nan_to_num(colors / scale, nan=1.0).clip(0.0, 1.0)
+    values[:, :3] = decoded_srgb(values[:, :3])
+    return values
 
 
 def _unit_normals(normals: Any, count: int) -> np.ndarray | None:
@@ -196,10 +207,11 @@ def _load_obj(path: Path, data: bytes) -> Scene:
     resolver: Any = _MaterialNames(text)
     read = _guarded(path, "OBJ", lambda: load_obj(io.StringIO(text), resolver=resolver))
 
-    notes: list[str] = []
-    textures: list[Texture] = []
-    files = [str(path)]
-    known = _read_libraries(path, libraries, textures, notes, files)
+    library = _read_libraries(path, libraries)
+    known, notes = library.materials, library.notes
+    left_out = len(re.findall(r"^[lp] ", text, re.MULTILINE))
+    if left_out:
+        notes.append(f"{path}: points and lines are left out ({left_out} times)")
     materials: dict[str, Material] = {}
     shapes = []
     unknown: list[str] = []
@@ -219,14 +231,22 @@ def _load_obj(path: Path, data: bytes) -> Scene:
         path=str(path),
         shapes=tuple(shapes),
         materials=tuple(materials.values()) or (Material(),),
-        textures=tuple(textures),
+        textures=tuple(library.textures),
         notes=tuple(notes),
-        files=(*files, *_texture_files(path, textures)),
+        files=(str(path), *library.files),
     )
 
 
-def _texture_files(path: Path, textures: list[Texture]) -> list[str]:
-    return [str(path.parent / texture.name) for texture in textures]
+def _read_libraries(path: Path, libraries: list[str]) -> MaterialLibrary:
+    """Return the materials of all ``mtllib`` lines."""
+    library = MaterialLibrary(path)
+    for line in libraries:
+        # A line names one file with spaces in its name, or several files.
+        for name in [line] if os.path.isfile(path.parent / line) else line.split():
+            library.read(name)
+    if library.lost:
+        library.notes.append(f"{path}: textures are left out: {_listed(library.lost)}")
+    return library
 
 
 def _listed(items: list[str]) -> str:
@@ -291,90 +311,3 @@ def _absolute_corner(corner: str, seen: list[int]) -> list[str] | None:
             index = str(absolute)
         parts[place] = index
     return parts
-
-
-def _read_libraries(
-    path: Path, libraries: list[str], textures: list[Texture], notes: list[str], files: list[str]
-) -> dict[str, Material]:
-    """Return the materials of all ``mtllib`` lines; fill the other lists with what was met."""
-    known: dict[str, Material] = {}
-    lost_textures: list[str] = []
-    for library in libraries:
-        # A line names one file with spaces in its name, or several files.
-        names = [library] if os.path.isfile(path.parent / library) else library.split()
-        for name in names:
-            try:
-                text = read_file(path.parent / name).decode("utf-8", "replace")
-            except InputError as error:
-                notes.append(f"materials are left out: {error}")
-                continue
-            files.append(str(path.parent / name))
-            known |= _parse_mtl(path, text, textures, lost_textures, notes)
-    if lost_textures:
-        notes.append(f"{path}: textures are left out: {_listed(lost_textures)}")
-    return known
-
-
-def _parse_mtl(
-    path: Path, text: str, textures: list[Texture], lost_textures: list[str], notes: list[str]
-) -> dict[str, Material]:
-    """Return the materials of an MTL file: ``Kd``, ``Ke``, ``map_Kd``; the rest is passed over.
-
-    Raises:
-        InputError: a colour is not finite.
-    """
-    known: dict[str, Material] = {}
-    name = ""
-    for line in text.splitlines():
-        keyword, _, rest = line.strip().replace("\t", " ").partition(" ")
-        rest = rest.strip()
-        if keyword == "newmtl" and rest:
-            name = " ".join(rest.split())
-            known[name] = Material(name=name)
-        elif name and keyword in ("Kd", "Ke"):
-            color = _color(rest)
-            if color is None:
-                continue
-            if not all(map(math.isfinite, color)):
-                raise InputError(
-                    f"{path}: material {name}: {keyword}: expected finite numbers; got {rest[:60]}"
-                )
-            if keyword == "Kd":
-                known[name] = replace(known[name], base_color=tuple(min(c, 1.0) for c in color))
-                continue
-            known[name] = replace(known[name], emission=limited(color))
-            if max(color) > MAX_RADIANCE:
-                notes.append(f"{path}: Ke of {name} above {MAX_RADIANCE:g} is set to that")
-        elif name and keyword == "map_Kd" and rest:
-            index = _texture_index(path, rest, textures, lost_textures)
-            known[name] = replace(known[name], base_color_texture=index)
-    return known
-
-
-def _color(text: str) -> tuple[float, float, float] | None:
-    """Return the RGB of ``r g b`` or ``r``; None if it is malformed or negative."""
-    try:
-        values = [float(word) for word in text.split()[:3]]
-    except ValueError:
-        return None
-    if len(values) == 1:
-        values *= 3
-    if len(values) != 3 or any(value < 0 for value in values):
-        return None
-    return values[0], values[1], values[2]
-
-
-def _texture_index(path: Path, text: str, textures: list[Texture], lost_textures: list[str]) -> int:
-    """Load the texture that a ``map_Kd`` line names and return its index; -1 if it can't be."""
-    # Options like "-s 1 1 1" come before the name and vary in length: the last word is the name.
-    name = (text.split()[-1] if text.startswith("-") else text).replace("\\", "/")
-    for index, texture in enumerate(textures):
-        if texture.name == name:
-            return index
-    try:
-        loaded = load_texture(path.parent / name)
-    except InputError as error:
-        lost_textures.append(str(error))
-        return -1
-    textures.append(replace(loaded, name=name))
-    return len(textures) - 1

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from psf_cl.scene.texture import decoded_srgb
+
 #: Reflectance at normal incidence of what is no metal.
 DIELECTRIC = 0.04
 
@@ -72,10 +74,7 @@ def _rows(picture: np.ndarray, rows: np.ndarray, height: int, width: int) -> np.
 
 
 def _linear(code: np.ndarray) -> np.ndarray:
-    """Return the linear values of 8-bit sRGB codes (IEC 61966-2-1)."""
-    x = np.arange(256) / 255.0
-    table = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
-    return table.astype(np.float32)[code]
+    return decoded_srgb(np.arange(256) / 255.0).astype(np.float32)[code]
 
 
 def _encoded(linear: np.ndarray) -> np.ndarray:

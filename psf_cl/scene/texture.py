@@ -86,3 +86,8 @@ def _rgba(image: Image.Image, source: str) -> np.ndarray:
     pixels = np.full((*grey.shape, 4), 255, np.uint8)
     pixels[..., :3] = ((grey + 128) // 257)[..., None]
     return pixels
+
+
+def decoded_srgb(values: np.ndarray) -> np.ndarray:
+    """Return linear values of sRGB ones, both from 0 to 1 (IEC 61966-2-1)."""
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
