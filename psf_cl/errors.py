@@ -16,6 +16,10 @@ class DeviceError(Exception):
     """The device or the run failed.  Exit code 1.  The message says what to do about it."""
 
 
+class NoRoomError(DeviceError):
+    """The device has no room for a buffer."""
+
+
 def shown(value: object) -> str:
     """Return how a message shows what the user gave: on one line, shortened."""
     if isinstance(value, dict):

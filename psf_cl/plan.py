@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from psf_cl.device import layout
-from psf_cl.errors import InputError
+from psf_cl.errors import DeviceError, InputError
 from psf_cl.image import AOVS
 from psf_cl.measure.timing import Declared
 from psf_cl.scene.model import (
@@ -32,6 +33,27 @@ from psf_cl.traits import DeviceTraits
 #: Bytes that the passes in flight may take before the ring is made shorter.
 RING_BYTES = 1 << 28
 
+#: Pixels of a render at most: kernels count samples in flight and planes of the film with 32 bits.
+MAX_PIXELS = 1 << 28
+
+#: Bytes of a buffer at most, whatever the device allows: kernels count with 32 bits.
+MAX_BUFFER_BYTES = (1 << 32) - 1
+
+#: Bytes a triangle that building the tree takes for a while, beyond what is left of it.
+BUILD_BYTES = 240
+
+#: The least of a pool, and how often it is halved on the way there.
+MIN_SLOTS = 1 << 12
+MAX_HALVINGS = 6
+
+
+@dataclass(frozen=True)
+class Room:
+    """Bytes that a render may take: in all, and in one buffer."""
+
+    total: int
+    largest: int = MAX_BUFFER_BYTES
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -43,6 +65,7 @@ class Plan:
         left_out: (name, why) of what this scene and these settings do not need.
         scene_buffers: tables of the scene.
         crop: (x, y, width, height) of what is rendered.
+        building: what building the tree needs for a while.
     """
 
     features: dict[str, Feature]
@@ -53,6 +76,7 @@ class Plan:
     crop: tuple[int, int, int, int]
     ring: int
     traits: DeviceTraits
+    building: tuple[BufferSpec, ...] = ()
 
     @property
     def pixel_count(self) -> int:
@@ -72,6 +96,27 @@ class Plan:
     @property
     def total_bytes(self) -> int:
         return sum(buffer.bytes for buffer in self.buffers)
+
+    @property
+    def peak_bytes(self) -> int:
+        """Return the bytes while the tree is built."""
+        return self.total_bytes + sum(buffer.bytes for buffer in self.building)
+
+    def lacks(self, room: Room) -> str | None:
+        """Return what does not fit into ``room``, in words, or None if everything does."""
+        large = max((*self.buffers, *self.building), key=lambda buffer: buffer.bytes)
+        largest = min(room.largest, MAX_BUFFER_BYTES)
+        if large.bytes > largest:
+            return (
+                f"{large.name} ({large.what}) needs {_mib(large.bytes)} MiB in one buffer, "
+                f"{_mib(largest)} are allowed"
+            )
+        if self.peak_bytes > room.total:
+            return (
+                f"the render needs {_mib(self.peak_bytes)} MiB, the most of it for {large.name} "
+                f"({large.what}); {_mib(room.total)} are there"
+            )
+        return None
 
     @property
     def declared(self) -> dict[str, Declared]:
@@ -115,6 +160,7 @@ class Plan:
             "outputs": sorted(self.outputs),
             "crop": list(self.crop),
             "total_bytes": self.total_bytes,
+            "peak_bytes": self.peak_bytes,
         }
 
 
@@ -127,6 +173,8 @@ def make_plan(
     statistics: bool = False,
     full: bool = False,
     halves: bool = False,
+    room: Room | None = None,
+    halvings: int = 0,
 ) -> Plan:
     """Derive what a render needs; works without OpenCL.
 
@@ -138,9 +186,13 @@ def make_plan(
         full: turn every feature on, with tables of nothing where the scene has none; the image
             stays the same, what it costs shows what leaving out gains.
         halves: whether half of the passes is to be summed apart, to estimate the error.
+        room: bytes that there are; without it, as many as it takes.
+        halvings: how often to halve the pool and what is in flight; where there is too little room
+            it is done once more.  It changes no bit of the image.
 
     Raises:
-        InputError: an unknown AOV, or a crop outside the film.
+        InputError: an unknown AOV, a crop outside the film, or too many pixels.
+        DeviceError: there is not enough room, however small the pool.
     """
     traits = traits or DeviceTraits.of_kind("cpu")
     outputs = frozenset(outputs)
@@ -161,6 +213,11 @@ def make_plan(
             f"--crop: {x},{y},{width},{height} is not inside the film of "
             f"{scene.width}x{scene.height}"
         )
+    if width * height > MAX_PIXELS:
+        raise InputError(
+            f"--size: {width}x{height} is more than {MAX_PIXELS} pixels; render parts with --crop"
+        )
+    whole_traits, traits = traits, _smaller(traits, halvings)
 
     shapes = visible_shapes(scene)
     triangles = sum(len(shape.mesh.triangles) for shape in shapes)
@@ -175,7 +232,7 @@ def make_plan(
         features,
         traits,
         pixel_count,
-        _ring(pixel_count, traits, features),
+        _ring(pixel_count, traits, features, RING_BYTES >> halvings),
         statistics=statistics,
         halves=halves,
         triangle_count=triangles,
@@ -197,7 +254,7 @@ def make_plan(
     ]
     if len(shapes) < len(scene.shapes):
         left_out.append(("shapes", f"{len(scene.shapes) - len(shapes)} are cut out whole"))
-    return Plan(
+    plan = Plan(
         features,
         tuple(stages),
         tuple(left_out),
@@ -206,10 +263,46 @@ def make_plan(
         crop,
         context.ring,
         traits,
+        () if context.on("FEW") else _building(triangles),
+    )
+    lacking = plan.lacks(room) if room is not None else None
+    if lacking is None:
+        return plan
+    if halvings == MAX_HALVINGS:
+        raise DeviceError(f"{lacking}; a smaller --size or --crop, or fewer --aov, need less")
+    return make_plan(
+        scene,
+        settings,
+        outputs,
+        whole_traits,
+        crop,
+        statistics,
+        full,
+        halves,
+        room,
+        halvings + 1,
     )
 
 
-def _ring(pixel_count: int, traits: DeviceTraits, features: dict[str, Feature]) -> int:
+def _smaller(traits: DeviceTraits, halvings: int) -> DeviceTraits:
+    """Return ``traits`` with a pool that was halved so often, down to MIN_SLOTS."""
+    slots = max(traits.slots >> halvings, min(MIN_SLOTS, traits.slots))
+    return dataclasses.replace(traits, slots=slots - slots % traits.block)
+
+
+def _building(triangles: int) -> tuple[BufferSpec, ...]:
+    tree = BufferSpec("tree", layout.BINARY_NODE.dtype, 2 * triangles, "the tree while it is built")
+    rest = max(BUILD_BYTES * triangles - tree.bytes, 0)
+    return tree, BufferSpec("boxes", np.dtype(np.uint8), rest, "what building the tree needs")
+
+
+def _mib(count: int) -> str:
+    return f"{count / 2**20:.0f}"
+
+
+def _ring(
+    pixel_count: int, traits: DeviceTraits, features: dict[str, Feature], ring_bytes: int
+) -> int:
     """Return how many passes may be in flight, a power of two.
 
     Long paths of an early pass must not stop the slots: a few times the pool in samples goes on
@@ -220,7 +313,7 @@ def _ring(pixel_count: int, traits: DeviceTraits, features: dict[str, Feature]) 
     cell_bytes = 16 + 32 + 36 if features["CELLS"].value else 0
     sample_bytes = 16 * planes + cell_bytes
     wanted = max(8 * traits.slots / pixel_count, 2)
-    affordable = max(RING_BYTES / (sample_bytes * pixel_count), 2)
+    affordable = max(ring_bytes / (sample_bytes * pixel_count), 2)
     ring = 2
     while ring < wanted and ring * 2 <= affordable:
         ring *= 2

@@ -23,10 +23,10 @@ from psf_cl.device.bvh import MIN_STACK_SIZE, Bvh, build_bvh, warm_up_builder
 from psf_cl.device.device import Buffer, Device, open_device
 from psf_cl.device.program import Launch, Program, load_program
 from psf_cl.device.sources import source_digest
-from psf_cl.errors import DeviceError, InputError
+from psf_cl.errors import DeviceError, InputError, NoRoomError
 from psf_cl.image import Image
 from psf_cl.measure.errors import error_of_halves
-from psf_cl.plan import Plan, make_plan
+from psf_cl.plan import Plan, Room, make_plan
 from psf_cl.scene.digest import scene_digest
 from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Scene
@@ -37,6 +37,9 @@ from psf_cl.stages import cells, film
 #: Looks of the host at the counters for each count of the paths by depth, which takes 0.4 ms on two
 #: CPU cores; the first look, which is left out, is at a pool that is still empty.
 LOOKS_PER_CENSUS = 8
+
+#: Share of the bytes that a device had no room for with which the next attempt is made.
+LESS_ROOM = 0.7
 
 #: Passes before the error is estimated for the first time, and the ratio from then on.
 FIRST_ESTIMATE = 16
@@ -52,6 +55,7 @@ class Renderer:
         halves: whether to sum half of the passes apart, which ``estimated_error`` needs.
         crop: (x, y, width, height) in pixels, or None for the whole film.
         full: build with every feature, to measure what leaving them out gains.
+        room: bytes that may be taken; what the device has, if that is less or none is given.
 
     Raises:
         InputError: the settings or outputs do not fit the scene.
@@ -68,15 +72,24 @@ class Renderer:
         statistics: bool = False,
         full: bool = False,
         halves: bool = False,
+        room: Room | None = None,
     ) -> None:
         self.scene = scene
         self.settings = settings or resolve(scene.render, scene.path)
         if not scene.cameras:
             raise InputError(f"{scene.path}: no camera")
         self.device = device or open_device(profiling=statistics)
-        self.plan: Plan = make_plan(
-            scene, self.settings, outputs, self.device.traits, crop, statistics, full, halves
-        )
+        there = Room(self.device.memory_bytes, self.device.largest_buffer)
+        if room is not None:
+            there = Room(min(room.total, there.total), min(room.largest, there.largest))
+
+        def plan_for(room: Room) -> Plan:
+            traits = self.device.traits
+            return make_plan(
+                scene, self.settings, outputs, traits, crop, statistics, full, halves, room
+            )
+
+        self.plan: Plan = plan_for(there)
         self.compile_seconds = 0.0
         self.statistics = statistics
         self.other_device = ""
@@ -86,7 +99,7 @@ class Renderer:
         self.depth_counts = np.zeros(film.CENSUS_BINS)
         self.buffers: dict[str, Buffer] = {}
         try:
-            self._set_up()
+            self._set_up(plan_for)
         except BaseException:
             self.close()
             raise
@@ -96,24 +109,25 @@ class Renderer:
             doubling_epoch if self.plan.in_epochs else None,
         )
 
-    def _set_up(self) -> None:
+    def _set_up(self, plan_for: Callable[[Room], Plan]) -> None:
         """Load and build while a second thread compiles."""
         background = ThreadPoolExecutor(1)
         try:
+            # What is compiled does not depend on how much room there is.
             compiling = background.submit(self._compile, MIN_STACK_SIZE)
-            start = time.perf_counter()
-            self._check_memory()
-            self._allocate()
-            geometry = self._upload_scene()
-            self.load_seconds = time.perf_counter() - start
-            self.build_seconds = 0.0
-            self.bvh: Bvh | None = None
-            if not self.plan.features["FEW"].value:
-                self.compile_seconds += warm_up_builder(self.device)
-                start = time.perf_counter()
-                self.bvh = self._build_bvh(geometry)
-                self.dropped_triangles = self.bvh.dropped
-                self.build_seconds = time.perf_counter() - start
+            while True:
+                try:
+                    self._fill_buffers()
+                    break
+                except NoRoomError as error:
+                    # Only by failing do drivers tell how much is free.
+                    self._release()
+                    try:
+                        self.plan = plan_for(Room(int(LESS_ROOM * self.plan.peak_bytes)))
+                    except DeviceError:
+                        raise DeviceError(
+                            f"{error}; a smaller --size or --crop, or fewer --aov, need less"
+                        ) from error
             self.programs = compiling.result()
         finally:
             # An error or Ctrl-C is told now, not when the compiler has come to its end.
@@ -121,6 +135,20 @@ class Renderer:
         if self.bvh is not None and self.bvh.stack_size != MIN_STACK_SIZE:
             self.programs = self._compile(self.bvh.stack_size)
         self._bind(self.programs)
+
+    def _fill_buffers(self) -> None:
+        start = time.perf_counter()
+        self._allocate()
+        geometry = self._upload_scene()
+        self.load_seconds = time.perf_counter() - start
+        self.build_seconds = 0.0
+        self.bvh: Bvh | None = None
+        if not self.plan.features["FEW"].value:
+            self.compile_seconds += warm_up_builder(self.device)
+            start = time.perf_counter()
+            self.bvh = self._build_bvh(geometry)
+            self.dropped_triangles = self.bvh.dropped
+            self.build_seconds = time.perf_counter() - start
 
     # What happens each bounce, in its order.
 
@@ -506,18 +534,13 @@ class Renderer:
     def close(self) -> None:
         """Give the device memory back."""
         self.device.wait()
+        self._release()
+
+    def _release(self) -> None:
         self.device.release(*self.buffers.values())
         self.buffers.clear()
 
     # Set-up.
-
-    def _check_memory(self) -> None:
-        needed, there = self.plan.total_bytes, self.device.memory_bytes
-        if needed > there:
-            raise DeviceError(
-                f"the render needs {needed / 2**20:.0f} MiB, {self.device.name} has "
-                f"{there / 2**20:.0f}; a smaller --size or --crop, or fewer AOVs, need less"
-            )
 
     def _allocate(self) -> None:
         for stage in self.plan.stages:

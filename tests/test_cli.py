@@ -52,6 +52,7 @@ class FakeRenderer:
         crop=None,
         statistics=False,
         halves=False,
+        room=None,
     ):
         type(self).made = {"settings": settings, "outputs": outputs, "crop": crop, "device": device}
         if self.build_error is not None:
@@ -670,6 +671,11 @@ class Report:
             [Report(ok=False, reason="the driver crashed (SIGILL)")],
             1,
             ["SIGILL", "fix: the driver is broken", "no OpenCL device can be used"],
+        ),
+        (
+            [Report(ok=False, reason="too little memory of the device: 64 MiB")],
+            1,
+            ["64 MiB", "fix: take another device with --device, or give this one more"],
         ),
         ([], 1, ["no OpenCL device can be used", "fix: install"]),
         (DeviceError("OpenCL does not start: No module named 'pyopencl'"), 1, ["pip install"]),

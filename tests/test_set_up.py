@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+import types
 from pathlib import Path
 
 import pytest
 
 from psf_cl.device import selftest
 from psf_cl.device.advice import driver_command
+from psf_cl.device.drivers import driver_problems
 from psf_cl.errors import DeviceError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -86,6 +88,31 @@ def test_a_loader_that_crashes_is_a_device_error(fake_python):
     fake_python("exit 0", listing="kill -SEGV $$")
     with pytest.raises(DeviceError, match="OpenCL does not start: the driver crashed"):
         selftest.probe_devices()
+
+
+def test_a_device_of_too_little_memory_is_reported():
+    small = types.SimpleNamespace(global_mem_size=64 << 20, max_mem_alloc_size=64 << 20)
+    reason = selftest.run_self_test(small)
+    assert reason == "too little memory of the device: 64 MiB, 128 are needed"
+    small.global_mem_size, small.max_mem_alloc_size = 1 << 40, 8 << 20
+    reason = selftest.run_self_test(small)
+    assert reason == "too little memory in one buffer: 8 MiB, 32 are needed"
+
+
+def test_drivers_that_cannot_be_loaded_are_named_with_the_fix(monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "platform", "linux")
+    (tmp_path / "gone.icd").write_text("libof_nobody.so\n")
+    (tmp_path / "fine.icd").write_text("libm.so.6\n")
+    (tmp_path / "odd.icd").write_text("")
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(tmp_path))
+    gone, odd = driver_problems()
+    assert "gone.icd names libof_nobody.so, which does not load: libof_nobody.so: " in gone[0]
+    assert gone[1] == f"install that driver again, or remove {tmp_path / 'gone.icd'}"
+    assert "odd.icd names no library" in odd[0]
+    nowhere = tmp_path / "nowhere"
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(nowhere))
+    told = (f"OCL_ICD_VENDORS={nowhere} is not there", "unset OCL_ICD_VENDORS")
+    assert driver_problems() == [told]
 
 
 def test_no_driver_gives_no_reports(monkeypatch, tmp_path):

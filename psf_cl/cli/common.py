@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
+    from psf_cl.plan import Room
     from psf_cl.scene.model import Scene
 
 
@@ -163,6 +164,12 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
         "--crop", metavar="X,Y,W,H", type=crop_argument, help="render only this part"
     )
     parser.add_argument(
+        "--memory",
+        metavar="MIB",
+        type=positive_integer,
+        help="device memory that may be taken; less than the device has makes the pool smaller",
+    )
+    parser.add_argument(
         "--aov",
         metavar="A,B,...",
         type=aov_argument,
@@ -182,6 +189,13 @@ def add_frame_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fps", metavar="F", type=positive_number, default=24.0, help="frames a second (24)"
     )
+
+
+def room_of(args: argparse.Namespace) -> Room | None:
+    """Return what ``--memory`` allows, None if it was not given."""
+    from psf_cl.plan import Room
+
+    return None if args.memory is None else Room(args.memory << 20)
 
 
 def load_with_settings(args: argparse.Namespace) -> tuple[Scene, Settings]:

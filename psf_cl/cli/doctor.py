@@ -28,6 +28,11 @@ _FIXES = (
     ),
     ("no answer", "the driver hangs: update it, or take another device with --device"),
     (
+        "too little memory",
+        "take another device with --device, or give this one more (a virtual machine's setting, "
+        "PoCL's POCL_MEMORY_LIMIT)",
+    ),
+    (
         "wrong results",
         "do not render on it: update the driver, or take another device with --device",
     ),
@@ -51,6 +56,7 @@ def run(args: argparse.Namespace) -> int:
     from rich.text import Text
 
     from psf_cl.device.advice import driver_command, system_ids
+    from psf_cl.device.drivers import driver_problems
     from psf_cl.device.selftest import probe_devices
 
     driver = driver_command(system_ids())
@@ -64,6 +70,8 @@ def run(args: argparse.Namespace) -> int:
         versions.add_row(name, version)
     show(versions, Text())
 
+    for problem, way_out in driver_problems():
+        print(f"{problem}\n  fix: {way_out}")
     try:
         reports = probe_devices()
     except DeviceError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from psf_cl.cli.common import add_scene_arguments, load_with_settings, show, tell_notes
+from psf_cl.cli.common import add_scene_arguments, load_with_settings, room_of, show, tell_notes
 
 if TYPE_CHECKING:
     from psf_cl.plan import Plan
@@ -32,7 +32,8 @@ def run(args: argparse.Namespace) -> int:
 
     scene, settings = load_with_settings(args)
     tell_notes(scene.notes)
-    plan = make_plan(scene, settings, args.aov, DeviceTraits.of_kind(args.kind), args.crop)
+    traits = DeviceTraits.of_kind(args.kind)
+    plan = make_plan(scene, settings, args.aov, traits, args.crop, room=room_of(args))
     if args.json:
         print(json_text(plan.as_dict(), indent=2))
     else:
@@ -65,6 +66,14 @@ def _show_plan(plan: Plan) -> None:
             buffers.add_row(buffer.name, owner, buffer.what, f"{buffer.bytes:,}")
     buffers.add_section()
     buffers.add_row("sum", "", f"{plan.total_bytes / 2**20:.1f} MiB", f"{plan.total_bytes:,}")
+
+    if plan.building:
+        buffers.add_row(
+            "peak",
+            "",
+            f"{plan.peak_bytes / 2**20:.1f} MiB while the tree is built",
+            f"{plan.peak_bytes:,}",
+        )
 
     width, height = plan.crop[2:]
     traits = plan.traits

@@ -26,6 +26,7 @@ from psf_cl.cli.common import (
     load_with_settings,
     positive_integer,
     positive_number,
+    room_of,
     tell_notes,
 )
 from psf_cl.cli.progress import ProgressDisplay
@@ -140,7 +141,8 @@ def run(args: argparse.Namespace) -> int:
         scene, settings = load_with_settings(args)
         read.set()
         check_distinct(outputs, [*scene.files, args.reference, _other_checkpoint(args)])
-        make_plan(scene, settings, args.aov, crop=args.crop)  # For its checks.
+        # For its checks; the device's own traits come later.
+        make_plan(scene, settings, args.aov, crop=args.crop, room=room_of(args))
         reference = _reference(args, scene) if args.reference else None
         device = opening.result()
     finally:
@@ -158,6 +160,7 @@ def run(args: argparse.Namespace) -> int:
         crop=args.crop,
         statistics=statistics,
         halves=args.noise is not None,
+        room=room_of(args),
     )
     if args.resume:
         with closed_on_error(renderer):
@@ -299,19 +302,20 @@ class Checkpoints:
         self._path = path
         self._seconds = seconds
         self._next: float | None = None
+        self._saved = 0
 
     def follow(self, progress: Progress) -> None:
         """Save if it is time to; render time does not count it."""
         if self._path is None:
             return
         if self._next is None:
-            self._next = progress.seconds + self._seconds
-        if progress.seconds >= self._next:
+            self._next, self._saved = progress.seconds + self._seconds, progress.passes
+        if progress.seconds >= self._next and progress.passes > self._saved:
             with self._renderer.outside_time():
                 start = time.perf_counter()
                 if self.save(progress.passes):
                     pause = max(self._seconds, 20.0 * (time.perf_counter() - start))
-                    self._next = progress.seconds + pause
+                    self._next, self._saved = progress.seconds + pause, progress.passes
 
     def save(self, passes: int) -> bool:
         """Write the checkpoint; return False if this is no moment for one."""

@@ -12,7 +12,7 @@ import numpy as np
 import pyopencl as cl
 
 from psf_cl.device.selftest import run_self_test
-from psf_cl.errors import DeviceError, InputError
+from psf_cl.errors import DeviceError, InputError, NoRoomError
 from psf_cl.measure.timing import TRANSFER, Interval, Spent
 from psf_cl.settings import DEVICE_VARIABLE
 from psf_cl.traits import DeviceTraits
@@ -78,6 +78,11 @@ class Device:
         return self.cl_device.global_mem_size
 
     @property
+    def largest_buffer(self) -> int:
+        """Return the bytes that the device allows in one buffer."""
+        return self.cl_device.max_mem_alloc_size
+
+    @property
     def driver(self) -> str:
         return f"{self.cl_device.platform.version} / {self.cl_device.driver_version}".strip()
 
@@ -85,21 +90,24 @@ class Device:
         """Return a zero-filled buffer of ``count`` (at least 1) items.
 
         Raises:
-            DeviceError: the device has no room for it.
+            NoRoomError: the device has no room for it.
         """
         dtype = np.dtype(dtype)
         count = max(int(count), 1)
         size = count * dtype.itemsize
-        limit = self.cl_device.max_mem_alloc_size
+        limit = self.largest_buffer
         if size > limit:
-            raise DeviceError(
+            raise NoRoomError(
                 f"{name} needs {size / 2**20:.0f} MiB; "
                 f"{self.name} allows {limit / 2**20:.0f} MiB in one buffer"
             )
-        with self.failures(f"allocating {size / 2**20:.0f} MiB for {name}"):
-            memory = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, size)
-            # A pattern of one byte divides every size.
-            event = cl.enqueue_fill_buffer(self.queue, memory, np.uint8(0), 0, size)
+        try:
+            with self.failures(f"allocating {size / 2**20:.0f} MiB for {name}"):
+                memory = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, size)
+                # A pattern of one byte divides every size.
+                event = cl.enqueue_fill_buffer(self.queue, memory, np.uint8(0), 0, size)
+        except DeviceError as error:
+            raise NoRoomError(str(error)) from error
         self.note_event(TRANSFER, f"clear {name}", size, event)
         self.allocated_bytes += size
         self.peak_bytes = max(self.peak_bytes, self.allocated_bytes)

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 PROBE_SECONDS = 120.0
 
+#: Memory that small pictures of small scenes take.
+LEAST_BYTES = 128 << 20
+
 _GROUP = 64
 _BINS = 13
 _SOURCE = """
@@ -93,6 +96,12 @@ def run_self_test(device: cl.Device, context: cl.Context | None = None) -> str |
     """
     import pyopencl as cl
 
+    for what, size, least in (
+        ("of the device", device.global_mem_size, LEAST_BYTES),
+        ("in one buffer", device.max_mem_alloc_size, LEAST_BYTES // 4),
+    ):
+        if size < least:
+            return f"too little memory {what}: {size >> 20} MiB, {least >> 20} are needed"
     count = 1000
     group_count = -(-count // _GROUP)
     # Near 1 the square needs more bits than a float has: only a fused x * x - 1 is right there.
