@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 
@@ -110,7 +113,8 @@ def eval_reflection(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
     metal = schlick(base, 1.0, cosine[..., None]) * (
         1 + base * metal_gain(b, wo[..., 2])[..., None]
     )
-    f = (1 - b.metallic) * dielectric(b, cosine)[..., None] + b.metallic * metal
+    clear = dielectric(b, cosine) * glass_raise(b, wo[..., 2])
+    f = (1 - b.metallic) * clear[..., None] + b.metallic * metal
     with np.errstate(all="ignore"):
         g = masking_shadowing(wo, wi, b.alpha)
         value = ggx(h, b.alpha) * g / (4 * wo[..., 2] * wi[..., 2]) * wi[..., 2]
@@ -164,6 +168,33 @@ def metal_gain(b: Bsdf, cosine: np.ndarray) -> np.ndarray:
     return (1 - kept) / kept
 
 
+@cache
+def glass_table() -> np.ndarray:
+    """Return the renderer's table; tests hold it against what comes back of white light."""
+    header = Path(__file__).resolve().parent.parent / "cl" / "common" / "glass_table.h"
+    text = header.read_text(encoding="utf-8")
+    shape = [int(n) for n in re.findall(r"#define GLASS_(?:COSINES|ALPHAS|INDICES) (\d+)", text)]
+    entries = [int(n) for n in re.findall(r"\d+", text.split("{")[1])]
+    return np.array(entries, float).reshape(shape) / 255
+
+
+def glass_raise(b: Bsdf, cosine: np.ndarray) -> np.ndarray:
+    """Return the factor of both lobes of solid glass, interpolated linearly along three axes."""
+    cosine = np.asarray(cosine, float)
+    if b.transmission == 0 or b.metallic == 1 or b.alpha <= 2e-3:
+        return np.ones_like(cosine)
+    x = (b.eta - 1) / (b.eta + 1)
+    t = np.sign(x) * np.sqrt(min(abs(x) * 1.5, 1))
+    table = glass_table()
+    for place in ((t + 1) / 2, b.alpha):
+        at = min(place, 1) * (table.shape[-1] - 1)
+        first = min(int(at), table.shape[-1] - 2)
+        table = table[..., first] + (at - first) * (table[..., first + 1] - table[..., first])
+    along = cosine * (1 + b.alpha) / (cosine + b.alpha)
+    kept = np.maximum(np.interp(along, np.linspace(0, 1, len(table)), table), 0.05)
+    return 1 + (1 / kept - 1) * b.transmission * b.specular
+
+
 def average_coat_albedo(b: Bsdf) -> float:
     """The renderer's fit; a test holds it against the mean of coat_albedo."""
     r, q = b.alpha**0.5, 1 / (1 + 8 * b.alpha)
@@ -199,7 +230,7 @@ def eval_refraction(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
         mirrored = wi * np.array([1, 1, -1])
         value = bent * (1 - b.specular * fresnel(oh, b.eta)) * ggx(h, b.alpha)
         value = value * masking_shadowing(wo, mirrored, b.alpha) * np.abs(wi[..., 2]) / b.eta**2
-    value = value * (1 - b.metallic) * b.transmission
+    value = value * (1 - b.metallic) * b.transmission * glass_raise(b, wo[..., 2])
     meets = (wi[..., 2] < 0) & (oh > 0) & (ih < 0)
     return np.where(meets, value, 0)[..., None] * np.array(b.base_color)
 

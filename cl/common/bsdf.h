@@ -14,8 +14,8 @@
 //
 // Scattering between facets: a metal's lobe is raised by 1 + F0 (1 - R(cos o)) / R(cos o), R the albedo
 // of a white one (Turquin: Practical Multiple Scattering Compensation for Microfacet Models, 2019), and
-// both lobes of a sheet of glass by 1 / R.  That gives up reciprocity, for no further lobe has to be
-// drawn.  What a bent ray loses in rough glass stays lost.
+// both lobes of glass by 1 / (what they leave of white light): of a sheet 1 / R, of a solid from
+// glass_table.h.  That gives up reciprocity, for no further lobe has to be drawn.
 //
 // LAYERS: f = sheen + (1 - S(cos o)) (coat + (1 - C(cos o)) f), S and C the albedos of sheen and coat.
 // Sheen: Estevez and Kulla, Production Friendly Microfacet Sheen BRDF, 2017, with the visibility of
@@ -24,6 +24,7 @@
 
 #include "lanes.h"
 #include "surface.h"
+#include "glass_table.h"
 
 // Below this a lobe is sharper than float can evaluate; roughness 0 is drawn with it.
 #define ALPHA_GGX_MIN 1e-3f
@@ -35,6 +36,7 @@ typedef struct {
 #endif
 #if TRANSMISSION
     Float refract;
+    Float raised; // factor of both lobes of glass, for what scatters between facets
 #endif
     Float diffuse;
 #if LAYERS
@@ -231,6 +233,39 @@ static inline Float dielectric_reflectance(Bsdf b, Float opaque, Float cosine)
 #endif
 }
 
+#if TRANSMISSION
+/// Part of white light that one bounce on rough solid glass leaves, never too little; 1 in other lanes.
+static inline Float glass_albedo(Mask wanted, Float alpha, Float eta, Float cosine)
+{
+    const Float x = (eta - 1.0f) / (eta + 1.0f);
+    const Float t = sqrt(min(fabs(x) * (1.0f / GLASS_LARGEST), (Float)(1.0f)));
+    const Float place[3] = {
+        clamp(cosine * (1.0f + alpha) / (cosine + alpha), (Float)(0.0f), (Float)(1.0f)) * (GLASS_COSINES - 1.0f),
+        alpha * (GLASS_ALPHAS - 1.0f), (0.5f + pick(x < 0.0f, -0.5f * t, 0.5f * t)) * (GLASS_INDICES - 1.0f)};
+    float lane_place[3][W];
+    float lane_value[W];
+    for (uint axis = 0; axis < 3; ++axis)
+        store_lanes(place[axis], lane_place[axis]);
+    store_lanes((Float)(1.0f), lane_value);
+    for (uint left = lane_bits(wanted); left; left &= left - 1u) {
+        const uint k = lowest_bit(left);
+        // Not a number becomes 0 here: no index leaves the table.
+        const float3 at = fmax((float3)(lane_place[0][k], lane_place[1][k], lane_place[2][k]), 0.0f);
+        const uint3 most = (uint3)(GLASS_COSINES - 2, GLASS_ALPHAS - 2, GLASS_INDICES - 2);
+        const uint3 first = min(convert_uint3(at), most);
+        const float3 part = fmin(at - convert_float3(first), 1.0f);
+        float sum[4];
+        for (uint corner = 0; corner < 4; ++corner) {
+            __constant uchar *row =
+                GLASS_TABLE + ((first.x + (corner >> 1)) * GLASS_ALPHAS + first.y + (corner & 1u)) * GLASS_INDICES + first.z;
+            sum[corner] = mix((float)row[0], (float)row[1], part.z);
+        }
+        lane_value[k] = mix(mix(sum[0], sum[1], part.y), mix(sum[2], sum[3], part.y), part.x) * (1.0f / 255.0f);
+    }
+    return max(load_lanes(lane_value), 0.05f);
+}
+#endif
+
 LARGE_FUNCTION LobeChances lobe_chances(Bsdf b, Float cos_o)
 {
     LobeChances c;
@@ -249,6 +284,18 @@ LARGE_FUNCTION LobeChances lobe_chances(Bsdf b, Float cos_o)
     c.enters = (1.0f - b.metallic) * (1.0f - reflected) / max(1.0f - average_coat_albedo(b), 1e-6f);
 #if TRANSMISSION
     c.enters *= 1.0f - b.transmission;
+    c.raised = 1.0f + pick(b.thin, c.gain, (Float)(0.0f)) * b.transmission;
+    const Mask rough = (b.transmission > 0.0f) & !b.thin & (b.metallic < 1.0f) & (b.alpha > 2.0f * ALPHA_GGX_MIN);
+    if (any_lane(rough)) {
+        // Without its reflection glass loses other light than the table says.
+#if LAYERS
+        const Float alpha = min(b.alpha, b.alpha_y);
+#else
+        const Float alpha = b.alpha;
+#endif
+        const Float kept = glass_albedo(rough, alpha, b.eta, cos_o);
+        c.raised = pick(rough, 1.0f + (1.0f / kept - 1.0f) * b.transmission * b.specular, c.raised);
+    }
 #endif
     const Float f = dielectric_reflectance(b, reflected, cos_o);
     const Float color = max3(b.base_color);
@@ -452,8 +499,7 @@ LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Flo
     coat = scale(add_scaled(b.tint, sub(white, b.tint), edge), f);
 #endif
 #if TRANSMISSION
-    const Float raised = 1.0f + pick(b.thin, chances.gain * b.transmission, (Float)(0.0f));
-    coat = scale(coat, raised);
+    coat = scale(coat, chances.raised);
 #endif
     const Vec3 fresnel = lerp3(coat, metal, b.metallic);
     const Float mirror = ggx_d(h, alpha) * ggx_visibility(wo, wi, cos_i, alpha) * cos_i;
@@ -485,7 +531,7 @@ LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Flo
     const Float share = (1.0f - b.metallic) * b.transmission;
     if (any_lane(behind)) {
         const Float kept_back = fresnel_dielectric(cos_h, b.eta);
-        const Float sheet = (1.0f - 2.0f * kept_back / (1.0f + kept_back) * b.specular) * share * mirror * raised;
+        const Float sheet = (1.0f - 2.0f * kept_back / (1.0f + kept_back) * b.specular) * share * mirror * chances.raised;
         value = pick_v(behind, scale(b.base_color, sheet), value);
         density = pick(behind, chances.refract * seen_mirrored, density);
     }
@@ -505,7 +551,8 @@ LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Flo
         // Masking times 1 / cos_o is 4 cos_i visibility; the radiance is compressed by 1 / eta^2.
         const Float weight = d * 4.0f * cos_t * ggx_visibility(wo, beyond, cos_t, alpha) * max(oh, 0.0f)
                              * jacobian / (b.eta * b.eta);
-        const Float through = (1.0f - fresnel_dielectric(max(oh, 1e-6f), b.eta) * b.specular) * share;
+        const Float through =
+            (1.0f - fresnel_dielectric(max(oh, 1e-6f), b.eta) * b.specular) * share * chances.raised;
         const Float seen = 2.0f * d * max(oh, 0.0f) / (wo.z + ggx_stretch(wo, alpha));
         value = pick_v(meets, scale(b.base_color, weight * through), value);
         density = pick(meets, chances.refract * seen * jacobian, density);
