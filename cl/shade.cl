@@ -72,7 +72,7 @@ static inline void store_features(
 ///
 /// reads   pool, scene tables
 /// writes  pool.{status, origin, direction, beta, radiance, direct, pdf, shadow, toward, light}; features;
-///         with CELLS pool.{vertex, length, beyond, share, light_share}, vertices
+///         with LIGHT_SAMPLING pool.light_normal; with CELLS pool.{vertex, length, beyond, share, light_share}, vertices
 kernel void shade_paths(
     __global const Params *params,
     __global const Surface *surfaces,
@@ -84,7 +84,7 @@ kernel void shade_paths(
 #endif
     __global const Material *materials TEXTURE_PARAMETERS COLOR_PARAMETERS,
 #if CONNECT
-    __global const Light *lights,
+    __global const Light *lights CHOICE_PARAMETERS,
 #endif
 #if ENVIRONMENT == 2
     __global const EnvironmentCell *environment,
@@ -117,14 +117,29 @@ kernel void shade_paths(
     Vec3 beta = get_v(path, PATH_BETA_R);
     Vec3 emitted = zero;
 
+#if LIGHT_SAMPLING
+    // What lights were chosen for at the last vertex.
+    const Vec3 last_p = get_v(path, PATH_ORIGIN_X);
+    const Vec3 last_n = unpack_unit(get_u(path, PATH_LIGHT_NORMAL));
+#elif CONNECT
+    const Vec3 last_p = zero;
+    const Vec3 last_n = zero;
+#endif
+
 #if ENVIRONMENT
     const Mask missed = alive & !hit;
     if (any_lane(missed)) {
         Float pdf_light;
-#if ENVIRONMENT == 2
-        const Vec3 radiance = eval_environment(params, environment, direction, &pdf_light);
+#if CONNECT
+        const Float chance = light_chance(params, lights CHOICE_ARGUMENTS, missed & !camera_ray,
+                                          (UInt)(params->environment_light), last_p, last_n);
 #else
-        const Vec3 radiance = eval_environment(params, direction, &pdf_light);
+        const Float chance = (Float)(0.0f);
+#endif
+#if ENVIRONMENT == 2
+        const Vec3 radiance = eval_environment(params, environment, direction, chance, &pdf_light);
+#else
+        const Vec3 radiance = eval_environment(params, direction, chance, &pdf_light);
 #endif
         const Float weight = emission_weight(params, camera_ray, pdf_bsdf, pdf_light);
         emitted = pick_v(missed, scale(radiance, weight), emitted);
@@ -153,8 +168,10 @@ kernel void shade_paths(
 #if CONNECT
         const Mask sampled = emits & (s.light != NO_LIGHT);
         const UInt light = pick_u(sampled, s.light, (UInt)(0u));
+        const Float chance =
+            light_chance(params, lights CHOICE_ARGUMENTS, sampled & !camera_ray, light, last_p, last_n);
         Float pdf_light =
-            area_light_density(lights, light, FIELD(path, PATH_HIT_T), fabs(dot3(s.ng, wo)));
+            area_light_density(lights, light, chance, FIELD(path, PATH_HIT_T), fabs(dot3(s.ng, wo)));
         pdf_light = pick(sampled, pdf_light, (Float)(0.0f));
 #else
         const Float pdf_light = (Float)(0.0f);
@@ -248,12 +265,22 @@ kernel void shade_paths(
     if (params->light_count > 0u) {
         const Float away = s.offset;
         const Vec3 above = add_scaled(s.p, s.ng, away);
+#if LIGHT_SAMPLING
+        // As the next vertex will know it.
+        const UInt normal = pack_unit(s.ng);
+        put_u(path, PATH_LIGHT_NORMAL, normal);
+        const Vec3 n = unpack_unit(normal);
+#else
+        const Vec3 n = s.ng;
+#endif
+        const LightChoice choice =
+            choose_light(params, lights CHOICE_ARGUMENTS, goes_on, above, n, light_bits);
         const LightSample light = sample_light(params, lights, surfaces,
                                                materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS,
 #if ENVIRONMENT == 2
                                                environment,
 #endif
-                                               goes_on, above, seed, index, pair, light_bits);
+                                               goes_on, above, seed, index, pair, choice);
         const Vec3 wi_local = vec3(dot3(tangent, light.wi), dot3(bitangent, light.wi), dot3(s.ns, light.wi));
         Float pdf;
         const Vec3 f = eval_bsdf(b, chances, wo_local, wi_local, dot3(s.ng, light.wi), &pdf);

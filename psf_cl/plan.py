@@ -357,6 +357,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
         and not m.unlit
         for m in materials
     )
+    connected = _connect(settings, any(emits(m) for m in materials) or sky, bool(lights))
     feature_aovs = outputs & {"albedo", "normal", "depth"}
     return {
         "TEXTURES": switch(
@@ -412,7 +413,8 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             if sky
             else "the environment is black",
         ),
-        "CONNECT": _connect(settings, any(emits(m) for m in materials) or sky, bool(lights)),
+        "CONNECT": connected,
+        "LIGHT_SAMPLING": _light_sampling(settings, bool(connected.value), _light_count(scene)),
         "LENS": _lens(scene),
         "AOV_DIRECT": switch(
             bool(outputs & {"direct", "indirect"}),
@@ -461,6 +463,8 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     }
     # A list of triangles is what small scenes have in place of something.
     full["FEW"] = Feature(0, f"a tree for measuring, though {features['FEW'].reason}")
+    # Other lights would be drawn: another image.
+    full["LIGHT_SAMPLING"] = features["LIGHT_SAMPLING"]
     return full
 
 
@@ -475,15 +479,30 @@ def _connect(settings: Settings, extended: bool, punctual: bool) -> Feature:
     return Feature(1, "lights are sampled at every vertex")
 
 
-def _scene_buffers(context: Context, scene: Scene) -> tuple[BufferSpec, ...]:
-    triangles = context.triangle_count
+def _light_sampling(settings: Settings, connected: bool, lights: int) -> Feature:
+    """Return whether lights are drawn from a tree, and why."""
+    if settings.light_sampling != "hierarchy":
+        return Feature(0, f"light_sampling is {settings.light_sampling}: a table of chances")
+    if not connected:
+        return Feature(0, "no light is sampled")
+    if lights == 1:
+        return Feature(0, "there is one light: nothing to choose")
+    return Feature(1, f"light_sampling is hierarchy: a tree of {lights} lights")
+
+
+def _light_count(scene: Scene) -> int:
+    """Return the entries of the light table, or a few more."""
     emitting = sum(
         len(shape.mesh.triangles)
         for shape in scene.shapes
         if emits(scene.materials[shape.material])
     )
-    punctual = sum(shines(light) for light in scene.lights)
-    lights = emitting + punctual + has_environment(scene.environment)
+    return emitting + sum(map(shines, scene.lights)) + has_environment(scene.environment)
+
+
+def _scene_buffers(context: Context, scene: Scene) -> tuple[BufferSpec, ...]:
+    triangles = context.triangle_count
+    lights = _light_count(scene)
     float32, uint8 = np.dtype(np.float32), np.dtype(np.uint8)
     buffers = [
         BufferSpec("params", layout.PARAMS.dtype, 1, "camera and settings"),
@@ -527,6 +546,14 @@ def _scene_buffers(context: Context, scene: Scene) -> tuple[BufferSpec, ...]:
         )
     if context.on("CONNECT"):
         buffers.append(BufferSpec("lights", layout.LIGHT.dtype, lights, "light table"))
+    if context.on("LIGHT_SAMPLING"):
+        uint32 = np.dtype(np.uint32)
+        buffers += [
+            BufferSpec("light_pairs", layout.LIGHT_PAIR.dtype, lights, "tree of lights"),
+            BufferSpec("light_bounds", layout.LIGHT_BOUNDS.dtype, lights, "to fit the tree"),
+            BufferSpec("light_order", uint32, lights, "levels of the tree"),
+            BufferSpec("light_places", uint32, 2 * lights, "where each light is in the tree"),
+        ]
     if context.features["ENVIRONMENT"].value == 2:
         buffers.append(
             BufferSpec(

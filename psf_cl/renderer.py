@@ -21,6 +21,7 @@ from psf_cl.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from psf_cl.device import layout
 from psf_cl.device.bvh import MIN_STACK_SIZE, Bvh, build_bvh, warm_up_builder
 from psf_cl.device.device import Buffer, Device, open_device
+from psf_cl.device.light_tree import LightTree, warm_up_light_tree
 from psf_cl.device.program import Launch, Program, load_program
 from psf_cl.device.sources import source_digest
 from psf_cl.errors import DeviceError, InputError, NoRoomError
@@ -91,6 +92,7 @@ class Renderer:
 
         self.plan: Plan = plan_for(there)
         self.compile_seconds = 0.0
+        self.technique_seconds = 0.0
         self.statistics = statistics
         self.other_device = ""
         self.looks = 0
@@ -108,6 +110,7 @@ class Renderer:
             self.plan.traits.slots,
             doubling_epoch if self.plan.in_epochs else None,
         )
+        self.scheduler.clock.seconds += self.technique_seconds
 
     def _set_up(self, plan_for: Callable[[Room], Plan]) -> None:
         """Load and build while a second thread compiles."""
@@ -149,6 +152,8 @@ class Renderer:
             self.bvh = self._build_bvh(geometry)
             self.dropped_triangles = self.bvh.dropped
             self.build_seconds = time.perf_counter() - start
+        if self.plan.features["LIGHT_SAMPLING"].value:
+            self._build_light_tree(geometry)
 
     # What happens each bounce, in its order.
 
@@ -552,7 +557,7 @@ class Renderer:
     def _upload_scene(self) -> tables.Geometry:
         scene, planned = self.scene, {spec.name for spec in self.plan.scene_buffers}
         geometry = tables.flatten(scene)
-        lights, environment_pmf = tables.light_table(scene, geometry, self.settings.light_sampling)
+        self.lights = lights = tables.light_table(scene, geometry, self.settings.light_sampling)
         textures, texels = tables.texture_tables(
             scene.textures if "textures" in planned else (), geometry.count
         )
@@ -560,7 +565,7 @@ class Renderer:
         if self.plan.features["FEW"].value:
             few = tables.few_triangles(geometry.positions, geometry.cut_out)
         self.dropped_triangles = few.dropped if few else 0
-        self.params = self._params(geometry, few, len(lights), environment_pmf)
+        self.params = self._params(geometry, few, lights)
 
         def or_zeros(table: np.ndarray | None, record: layout.Record) -> np.ndarray:
             return np.zeros(geometry.count, record.dtype) if table is None else table
@@ -594,8 +599,7 @@ class Renderer:
         self,
         geometry: tables.Geometry,
         few: tables.Few | None,
-        light_count: int,
-        environment_pmf: float,
+        lights: np.ndarray,
     ) -> np.ndarray:
         scene, settings = self.scene, self.settings
         params = np.zeros(1, layout.PARAMS.dtype)
@@ -618,15 +622,16 @@ class Renderer:
             "roulette_depth": settings.roulette_depth
             if settings.termination == "roulette"
             else 0xFFFFFFFF,
-            "light_count": light_count,
+            "light_count": len(lights),
+            "environment_light": tables.environment_light(lights),
             "corner_count": len(few.corners) if few else 0,
             "face_count": len(few.faces) if few else 0,
             "environment_width": 1 if image is None else image.shape[1],
             "environment_height": 1 if image is None else image.shape[0],
             "environment_radiance": scene.environment.radiance,
-            "environment_pmf": environment_pmf,
             "environment_rotation": np.asarray(scene.environment.rotation).T.reshape(9),
             "scene_radius": max(geometry.radius, float(np.finfo(np.float32).tiny)),
+            "scene_center": geometry.center,
             "direct_sampling": layout.CONSTANT[f"DIRECT_{settings.direct_sampling.upper()}"],
             "sampler": layout.CONSTANT[f"SAMPLER_{settings.sampler.upper()}"],
         }
@@ -649,6 +654,17 @@ class Renderer:
             device.release(*inputs)
         self.buffers |= {"nodes": bvh.nodes, "blocks": bvh.blocks}
         return bvh
+
+    def _build_light_tree(self, geometry: tables.Geometry) -> None:
+        self.compile_seconds += warm_up_light_tree(self.device)
+        start = time.perf_counter()
+        share = tables.near_share(self.lights)
+        self.light_tree = LightTree(
+            self.device, self.lights, self.buffers["lights"], share, geometry.radius
+        )
+        self.buffers |= self.light_tree.buffers
+        self.device.wait()
+        self.technique_seconds = time.perf_counter() - start
 
     def _compile(self, stack_size: int) -> dict[str, Program]:
         """Build the stages' programs, down to machine code; runs beside the scene's loading."""

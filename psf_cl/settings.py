@@ -47,7 +47,11 @@ class Settings:
 
     integrator: str = _choice("path", doc="how paths are built")
     light_sampling: str = _choice(
-        "power", "uniform", doc="how next event estimation picks an emitter"
+        "power",
+        "uniform",
+        "hierarchy",
+        doc="how next event estimation picks an emitter; hierarchy: a tree of lights asks for what "
+        "each might bring to a surface",
     )
     direct_sampling: str = _choice(
         "mis", "light", "bsdf", doc="direct light by both strategies, or by one of them alone"

@@ -62,7 +62,7 @@ class Geometry:
         colors: ``(n,)`` layout.VERTEX_COLORS, or None if no mesh has colours.
         tangents: ``(n,)`` layout.TANGENTS, or None if no material asks for them.
         cut_out: ``(n,)`` bool, whether hits must look up their alpha.
-        radius: of a sphere around all finite vertices; m.
+        center, radius: of a sphere around all finite vertices; world, m.
     """
 
     positions: np.ndarray
@@ -72,6 +72,7 @@ class Geometry:
     colors: np.ndarray | None
     tangents: np.ndarray | None
     cut_out: np.ndarray
+    center: np.ndarray
     radius: float
 
     @property
@@ -150,6 +151,7 @@ def flatten(scene: Scene) -> Geometry:
         joined(colors, layout.VERTEX_COLORS.dtype) if colored else None,
         joined(tangents, layout.TANGENTS.dtype) if directed else None,
         joined(cut_out, np.dtype(bool)),
+        0.5 * low + 0.5 * high,
         float(np.linalg.norm(high - low)) / 2,
     )
 
@@ -430,13 +432,13 @@ def alias_chances(keep: np.ndarray, other: np.ndarray) -> np.ndarray:
     return chance / len(keep)
 
 
-def light_table(scene: Scene, geometry: Geometry, sampling: str) -> tuple[np.ndarray, float]:
-    """Return ``(n,)`` layout.LIGHT and the environment's chance; sets the surfaces' ``light``.
+def light_table(scene: Scene, geometry: Geometry, sampling: str) -> np.ndarray:
+    """Return ``(n,)`` layout.LIGHT; sets the surfaces' ``light``.
 
     Entries are the emitting triangles (those with an area), the environment, the punctual lights.
 
     Args:
-        sampling: ``"power"`` or ``"uniform"``, what the chances follow.
+        sampling: what the chances follow: ``"uniform"``, or else the power.
     """
     glow = np.array([emits(material) for material in scene.materials], bool)
     sided = np.array([2.0 if material.double_sided else 1.0 for material in scene.materials])
@@ -471,6 +473,7 @@ def light_table(scene: Scene, geometry: Geometry, sampling: str) -> tuple[np.nda
     power[: len(triangles)] = area * radiance[of] * sided[of] * math.pi
     # A texture may be black on average and still glow somewhere.
     power[: len(triangles)] = np.maximum(power[: len(triangles)], power.max(initial=0.0) * 1e-6)
+    table["power"][: len(triangles)] = power[: len(triangles)] / (sided[of] * math.pi)
 
     at = len(triangles)
     radius = max(geometry.radius, 1e-30)
@@ -478,11 +481,12 @@ def light_table(scene: Scene, geometry: Geometry, sampling: str) -> tuple[np.nda
         table["kind"][at] = layout.CONSTANT["LIGHT_ENVIRONMENT"]
         mean = _environment_mean(scene.environment) @ LUMINANCE
         power[at] = 4.0 * math.pi * mean * math.pi * radius**2
+        table["power"][at] = math.pi * mean
         far[at] = True
         at += 1
     for light in punctual:
         _fill_punctual(table[at], light)
-        strength = float(np.asarray(light.intensity) @ LUMINANCE)
+        table["power"][at] = strength = float(np.asarray(light.intensity) @ LUMINANCE)
         if light.kind == "directional":
             power[at] = strength * math.pi * radius**2
             far[at] = True
@@ -493,7 +497,7 @@ def light_table(scene: Scene, geometry: Geometry, sampling: str) -> tuple[np.nda
         at += 1
 
     if not len(table):
-        return table, 0.0
+        return table
     if sampling == "uniform" or not power.sum() > 0.0:
         chance = np.full(len(table), 1.0 / len(table))
     else:
@@ -504,7 +508,19 @@ def light_table(scene: Scene, geometry: Geometry, sampling: str) -> tuple[np.nda
             chance[~far] *= NEAR_SHARE / (1.0 - share)
     table["keep"], table["other"] = alias_table(chance)
     table["pmf"] = alias_chances(table["keep"], table["other"])
-    return table, float(table["pmf"][len(triangles)]) if sky else 0.0
+    return table
+
+
+def environment_light(lights: np.ndarray) -> int:
+    """Return the index of the environment in a light table, 0 if it is not there."""
+    found = np.flatnonzero(lights["kind"] == layout.CONSTANT["LIGHT_ENVIRONMENT"])
+    return int(found[0]) if len(found) else 0
+
+
+def near_share(lights: np.ndarray) -> float:
+    """Return the chance of a light table that is not for lights infinitely far."""
+    far = [layout.CONSTANT[f"LIGHT_{kind}"] for kind in ("ENVIRONMENT", "DIRECTIONAL")]
+    return float(lights["pmf"][~np.isin(lights["kind"], far)].sum())
 
 
 def _fill_triangles(

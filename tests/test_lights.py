@@ -24,7 +24,9 @@ class Lit:
     def __init__(self, device, scene, sampling="power", scene_radius=10.0):
         self.device, self.scene = device, scene
         self.geometry = tables.flatten(scene)
-        self.lights, self.sky_pmf = tables.light_table(scene, self.geometry, sampling)
+        self.lights = tables.light_table(scene, self.geometry, sampling)
+        sky = self.lights["kind"] == CONSTANT["LIGHT_ENVIRONMENT"]
+        self.sky_pmf = self.lights["pmf"][sky].sum()
         image = scene.environment.image
         self.defines = {
             "AREA_LIGHTS": 1,
@@ -35,7 +37,8 @@ class Lit:
         params = np.zeros(1, layout.PARAMS.dtype)
         row = params[0]
         row["seed"], row["sampler"] = 3, CONSTANT["SAMPLER_RANDOM"]
-        row["light_count"], row["environment_pmf"] = len(self.lights), self.sky_pmf
+        row["light_count"] = len(self.lights)
+        row["environment_light"] = tables.environment_light(self.lights)
         row["environment_radiance"] = scene.environment.radiance
         row["environment_rotation"] = np.asarray(scene.environment.rotation).T.ravel()
         row["scene_radius"] = scene_radius
@@ -92,7 +95,8 @@ class Lit:
         """Return radiance ``(n, 3)`` and density ``(n,)`` of directions ``(n, 3)``."""
         inputs = {"directions": np.ascontiguousarray(directions.T, np.float32)}
         outputs = {"radiance": (np.float32, 3), "pdfs": (np.float32, 1)}
-        radiance, pdf = self.run("look_up_sky", inputs, outputs, **self.sky)
+        lights = self.buffers["lights"]
+        radiance, pdf = self.run("look_up_sky", inputs, outputs, lights=lights, **self.sky)
         return radiance.T, pdf
 
     def release(self):
@@ -587,7 +591,7 @@ def test_chances_of_lights_are_the_chances_of_their_table():
     dim = Material(emission=(1e-9, 1e-9, 1e-9), double_sided=True)
     bright = Material(emission=(1e4, 1e4, 1e4), double_sided=True)
     scene = triangles_scene(CORNERS, [dim, bright], of)
-    lights, _ = tables.light_table(scene, tables.flatten(scene), "power")
+    lights = tables.light_table(scene, tables.flatten(scene), "power")
     exact = chances_of(lights["keep"], lights["other"])
     np.testing.assert_allclose(lights["pmf"], exact, rtol=1e-6)
     cells = tables.environment_cells(SKIES["sun"])
@@ -604,8 +608,7 @@ def test_power_is_what_the_formulas_say():
     )
     scene = triangles_scene(CORNERS, [*GLOW, Material()], [0, 1, 3, 2], lights=lights)
     geometry = tables.flatten(scene)
-    table, sky = tables.light_table(scene, geometry, "power")
-    assert sky == 0.0
+    table = tables.light_table(scene, geometry, "power")
     level = [np.asarray(m.emission) @ LUMINANCE for m in GLOW]
     power = np.pi * np.array([area[0] * level[0], 2 * area[1] * level[1], 2 * area[3] * level[2]])
     power = [*power, 4 * np.pi, 3 * 2 * np.pi * (1 - math.cos(0.5))]
@@ -614,14 +617,14 @@ def test_power_is_what_the_formulas_say():
     none = CONSTANT["NO_LIGHT"]
     np.testing.assert_array_equal(geometry.surfaces["light"], [0, 1, none, 2])
 
-    table, _ = tables.light_table(scene, geometry, "uniform")
+    table = tables.light_table(scene, geometry, "uniform")
     np.testing.assert_allclose(table["pmf"], 0.2, rtol=1e-6)
 
 
 def test_far_light_leaves_near_lights_their_share():
     sun = Light("directional", (1e5, 1e5, 1e5))
     scene = triangles_scene(CORNERS, GLOW, [0, 1, 2, 2], lights=(sun,), environment=SKIES["odd"])
-    table, sky = tables.light_table(scene, tables.flatten(scene), "power")
+    table = tables.light_table(scene, tables.flatten(scene), "power")
     np.testing.assert_allclose(table["pmf"].sum(), 1, rtol=1e-6)
     np.testing.assert_allclose(table["pmf"][:4].sum(), tables.NEAR_SHARE, rtol=1e-5)
     # The sky's power is pi R^2 times 4 pi times its mean, the sun's pi R^2 times its lux.
@@ -631,12 +634,12 @@ def test_far_light_leaves_near_lights_their_share():
     ]
     flux = ((cells * np.asarray(SKIES["odd"].radiance)) @ LUMINANCE * solid).sum()
     np.testing.assert_allclose(table["pmf"][4] / table["pmf"][5], flux / 1e5, rtol=5e-3)
-    assert sky == pytest.approx(table["pmf"][4])
+    assert tables.environment_light(table) == 4
 
 
 def test_triangles_without_area_and_dark_materials_are_no_lights():
     flat = [[0, 0, 0], [1, 1, 1], [2, 2, 2]]
     broken = [[0, 0, 0], [np.nan, 0, 0], [0, 1, 0]]
     scene = triangles_scene([flat, broken, CORNERS[0]], [*GLOW, Material()], [0, 0, 3])
-    table, _ = tables.light_table(scene, tables.flatten(scene), "power")
+    table = tables.light_table(scene, tables.flatten(scene), "power")
     assert len(table) == 0

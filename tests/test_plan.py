@@ -246,7 +246,9 @@ def test_every_flag_at_once_renders(wants):
     colored = replace(FLAT_QUAD, colors=np.ones((len(FLAT_QUAD.positions), 4), np.float32))
     shape = replace(scene.shapes[0], mesh=colored, material=len(scene.materials))
     scene = replace(scene, shapes=(*scene.shapes, shape), materials=(*scene.materials, layered))
-    opened = renderer(wants(flags), scene, AOVS, path_filter="hash_grid")
+    opened = renderer(
+        wants(flags), scene, AOVS, path_filter="hash_grid", light_sampling="hierarchy"
+    )
     assert all(feature.value for feature in opened.plan.features.values())
     assert opened.plan.left_out == ()
     opened.render(spp=4)

@@ -40,6 +40,9 @@
 #ifndef CONNECT
 #error "CONNECT must be 0 or 1"
 #endif
+#ifndef LIGHT_SAMPLING
+#error "LIGHT_SAMPLING must be 0 (a table of chances) or 1 (a tree of lights)"
+#endif
 #ifndef LENS
 #error "LENS must be 0 (a pinhole), 1 (a lens) or 2 (parallel rays)"
 #endif

@@ -76,28 +76,34 @@
 #define PATH_LIGHT_R 30u // radiance that arrives if nothing is in between, times beta; all 0: no ray
 #define PATH_LIGHT_G 31u
 #define PATH_LIGHT_B 32u
-#if CELLS >= 1
-#define PATH_VERTEX (33u + 0u) // uint; 1 + depth of the vertex behind which light is shared, VERTEX_NEAR; 0: none
-#define PATH_LENGTH (33u + 1u) // m, from the camera on
-#define PATH_BEYOND_R (33u + 2u) // of what was gathered, what is shared: it came from beyond that vertex
-#define PATH_BEYOND_G (33u + 3u)
-#define PATH_BEYOND_B (33u + 4u)
-#define PATH_END_1 (33u + 5u)
+#if LIGHT_SAMPLING >= 1
+#define PATH_LIGHT_NORMAL (33u + 0u) // uint; packed: what the last light was chosen for, besides the origin
+#define PATH_END_1 (33u + 1u)
 #else
 #define PATH_END_1 33u
 #endif
-#if CELLS >= 2
-#define PATH_SHARE_R (PATH_END_1 + 0u) // part of what comes from beyond the vertex that its diffuse base reflects
-#define PATH_SHARE_G (PATH_END_1 + 1u)
-#define PATH_SHARE_B (PATH_END_1 + 2u)
-#define PATH_LIGHT_SHARE_R (PATH_END_1 + 3u) // the same of the shadow ray
-#define PATH_LIGHT_SHARE_G (PATH_END_1 + 4u)
-#define PATH_LIGHT_SHARE_B (PATH_END_1 + 5u)
-#define PATH_END_2 (PATH_END_1 + 6u)
+#if CELLS >= 1
+#define PATH_VERTEX (PATH_END_1 + 0u) // uint; 1 + depth of the vertex behind which light is shared, VERTEX_NEAR; 0: none
+#define PATH_LENGTH (PATH_END_1 + 1u) // m, from the camera on
+#define PATH_BEYOND_R (PATH_END_1 + 2u) // of what was gathered, what is shared: it came from beyond that vertex
+#define PATH_BEYOND_G (PATH_END_1 + 3u)
+#define PATH_BEYOND_B (PATH_END_1 + 4u)
+#define PATH_END_2 (PATH_END_1 + 5u)
 #else
 #define PATH_END_2 PATH_END_1
 #endif
-#define PATH_FIELD_COUNT PATH_END_2
+#if CELLS >= 2
+#define PATH_SHARE_R (PATH_END_2 + 0u) // part of what comes from beyond the vertex that its diffuse base reflects
+#define PATH_SHARE_G (PATH_END_2 + 1u)
+#define PATH_SHARE_B (PATH_END_2 + 2u)
+#define PATH_LIGHT_SHARE_R (PATH_END_2 + 3u) // the same of the shadow ray
+#define PATH_LIGHT_SHARE_G (PATH_END_2 + 4u)
+#define PATH_LIGHT_SHARE_B (PATH_END_2 + 5u)
+#define PATH_END_3 (PATH_END_2 + 6u)
+#else
+#define PATH_END_3 PATH_END_2
+#endif
+#define PATH_FIELD_COUNT PATH_END_3
 
 #define COUNTER_NEXT_PIXEL 0u // next pixel to be started, counted from the first pixel of next_pass
 #define COUNTER_NEXT_PASS 1u // pass that next_pixel 0 belongs to
@@ -145,12 +151,13 @@ typedef struct {
     uint max_depth; // bounces
     uint roulette_depth; // bounces before roulette
     uint light_count; // entries of the light table
+    uint environment_light; // index of the environment in it
     uint environment_width; // texels
     uint environment_height; // texels
     float environment_radiance[3]; // constant sky, or factor of the image
-    float environment_pmf; // chance that the light table picks the environment
     float environment_rotation[9]; // world to local, row-major
     float scene_radius; // m, of the bounding sphere
+    float scene_center[3]; // of it; world, m
     uint direct_sampling; // DIRECT_MIS, DIRECT_LIGHT or DIRECT_BSDF
     uint sampler; // SAMPLER_SOBOL or SAMPLER_RANDOM
     uint corner_count; // of the list of corners, where all triangles are tested
@@ -170,6 +177,7 @@ typedef struct {
     float previous_forward[3]; // unit, world
     float previous_scale_x; // tangent of half the horizontal field of view
     float previous_scale_y; // tangent of half the vertical field of view
+    uint pad[1]; // fills the record
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.
@@ -306,8 +314,29 @@ typedef struct {
     float offset; // of a triangle, as Surface.offset
     uint emission_texture; // index, NO_TEXTURE for none
     uint flags; // of the material
-    float pad[5]; // fills the record
+    float power; // candela along its brightest direction, or lux from infinitely far
+    float pad[4]; // fills the record
 } Light;
+
+/// Two sibling nodes of the tree of lights; one cache line.
+typedef struct {
+    float center[2][3]; // of a sphere around the lights; world, m
+    float radius[2]; // m; infinite: `power` is the weight wherever it is asked for
+    float power[2]; // of all its lights, as Light.power, in any one unit
+    float cos_spread[2]; // of the angle between the axis and any direction that a light faces
+    uint axis[2]; // mean direction that the lights face, octahedral, 16 bits a coordinate
+    uint child[2]; // index of a pair, or LEAF_BIT | index of a light; NO_LIGHT if there is none
+} LightPair;
+
+/// What both nodes of a LightPair have in common, to fit their parent.
+typedef struct {
+    float low[3]; // world, m
+    float power; // as in LightPair
+    float high[3]; // world, m
+    float spread; // radians, as in LightPair
+    float axis[3]; // unit
+    uint far; // whether one of the lights is infinitely far
+} LightBounds;
 
 /// A texel of the environment: radiance and its slot of the alias table.
 typedef struct {

@@ -4,6 +4,7 @@
 #include "lanes.h"
 #include "layout.h"
 #include "alpha.h"
+#include "light_tree.h"
 #include "rng.h"
 #include "surface.h"
 
@@ -90,13 +91,15 @@ LARGE_FUNCTION Vec3 environment_look_up(
 #endif
 
 #if ENVIRONMENT
-/// Radiance from direction `d`, and the density with which sample_light draws it.
+/// Radiance from direction `d`, and the density with which sample_light draws it, given the chance that
+/// the environment is the light that is chosen.
 LARGE_FUNCTION Vec3 eval_environment(
     __global const Params *params,
 #if ENVIRONMENT == 2
     __global const EnvironmentCell *cells,
 #endif
     Vec3 d,
+    Float chance,
     Float *pdf)
 {
     const Vec3 factor = vec3_of(params->environment_radiance);
@@ -107,26 +110,74 @@ LARGE_FUNCTION Vec3 eval_environment(
     environment_uv(params, d, &u, &v, &sine);
     const UInt cell = environment_cell(params, u * (float)params->environment_width,
                                        v * (float)params->environment_height);
-    *pdf = params->environment_pmf * environment_density(params, cells, cell, sine);
+    *pdf = chance * environment_density(params, cells, cell, sine);
     return mul(factor, environment_look_up(params, cells, u, v));
 #else
-    *pdf = (Float)(params->environment_pmf * 0.25f * INV_PI);
+    *pdf = chance * (0.25f * INV_PI);
     return factor;
 #endif
 }
 #endif
 
 #if AREA_LIGHTS
-/// Density per solid angle with which sample_light draws a point at distance `t` on an emitter.
-static inline Float area_light_density(__global const Light *lights, UInt light, Float t, Float cosine)
+/// Density per solid angle with which sample_light draws a point at distance `t` on an emitter that is
+/// chosen with `chance`.
+static inline Float area_light_density(
+    __global const Light *lights, UInt light, Float chance, Float t, Float cosine)
 {
     const Float area = GATHER(lights, light, area);
-    const Float pdf = GATHER(lights, light, pmf) * t * t / max(cosine * area, 1e-30f);
+    const Float pdf = chance * t * t / max(cosine * area, 1e-30f);
     return pick((cosine > 0.0f) & (area > 0.0f), pdf, (Float)(0.0f));
 }
 #endif
 
-/// Draw a light, then a direction to it, for rays that start at `origin`.
+// What choosing a light takes beside the table.
+#if LIGHT_SAMPLING
+#define CHOICE_PARAMETERS , __global const LightPair *light_pairs, __global const uint *light_places
+#define CHOICE_ARGUMENTS , light_pairs, light_places
+#else
+#define CHOICE_PARAMETERS
+#define CHOICE_ARGUMENTS
+#endif
+
+/// Draw a light for a surface at `p` with normal `n`.
+static inline LightChoice choose_light(
+    __global const Params *params,
+    __global const Light *lights CHOICE_PARAMETERS,
+    Mask active,
+    Vec3 p,
+    Vec3 n,
+    UInt bits)
+{
+#if LIGHT_SAMPLING
+    return choose_in_tree(light_pairs, params->light_count, active, p, n, bits);
+#else
+    LightChoice choice;
+    Float alias_u;
+    const UInt slot = alias_slot(bits, params->light_count, &alias_u);
+    choice.light = pick_u(alias_u < GATHER(lights, slot, keep), slot, GATHER_U(lights, slot, other));
+    choice.pmf = GATHER(lights, choice.light, pmf);
+    return choice;
+#endif
+}
+
+/// Chance with which choose_light draws `light`.
+static inline Float light_chance(
+    __global const Params *params,
+    __global const Light *lights CHOICE_PARAMETERS,
+    Mask active,
+    UInt light,
+    Vec3 p,
+    Vec3 n)
+{
+#if LIGHT_SAMPLING
+    return chance_in_tree(light_pairs, light_places, params->light_count, active, light, p, n);
+#else
+    return GATHER(lights, light, pmf);
+#endif
+}
+
+/// Draw a direction to the light that was chosen, for rays that start at `origin`.
 ///
 /// pdf is 0 where nothing arrives.  `seed`, `reversed_index` and `pair` (the vertex's first) name the numbers.
 LARGE_FUNCTION LightSample sample_light(
@@ -142,17 +193,15 @@ LARGE_FUNCTION LightSample sample_light(
     UInt seed,
     UInt reversed_index,
     UInt pair,
-    UInt choice_bits)
+    LightChoice choice)
 {
     Float u1;
     Float u2;
     sample_pair(seed, reversed_index, pair + PAIR_LIGHT, params->sampler, &u1, &u2);
 
-    Float alias_u;
-    UInt light = alias_slot(choice_bits, params->light_count, &alias_u);
-    light = pick_u(alias_u < GATHER(lights, light, keep), light, GATHER_U(lights, light, other));
+    const UInt light = choice.light;
+    const Float pmf = choice.pmf;
     const UInt kind = GATHER_U(lights, light, kind);
-    const Float pmf = GATHER(lights, light, pmf);
 
     LightSample s;
     s.toward = vec3((Float)(0.0f), (Float)(0.0f), (Float)(1.0f));

@@ -80,12 +80,13 @@ PARAMS = Record(
     uint max_depth - bounces
     uint roulette_depth - bounces before roulette
     uint light_count - entries of the light table
+    uint environment_light - index of the environment in it
     uint environment_width - texels
     uint environment_height - texels
     float environment_radiance[3] - constant sky, or factor of the image
-    float environment_pmf - chance that the light table picks the environment
     float environment_rotation[9] - world to local, row-major
     float scene_radius - m, of the bounding sphere
+    float scene_center[3] - of it; world, m
     uint direct_sampling - DIRECT_MIS, DIRECT_LIGHT or DIRECT_BSDF
     uint sampler - SAMPLER_SOBOL or SAMPLER_RANDOM
     uint corner_count - of the list of corners, where all triangles are tested
@@ -105,6 +106,7 @@ PARAMS = Record(
     float previous_forward[3] - unit, world
     float previous_scale_x - tangent of half the horizontal field of view
     float previous_scale_y - tangent of half the vertical field of view
+    uint pad[1] - fills the record
     """),
 )
 
@@ -274,7 +276,34 @@ LIGHT = Record(
     float offset - of a triangle, as Surface.offset
     uint emission_texture - index, NO_TEXTURE for none
     uint flags - of the material
-    float pad[5] - fills the record
+    float power - candela along its brightest direction, or lux from infinitely far
+    float pad[4] - fills the record
+    """),
+)
+
+LIGHT_PAIR = Record(
+    "LightPair",
+    "Two sibling nodes of the tree of lights; one cache line.",
+    _fields("""
+    float center[2][3] - of a sphere around the lights; world, m
+    float radius[2] - m; infinite: `power` is the weight wherever it is asked for
+    float power[2] - of all its lights, as Light.power, in any one unit
+    float cos_spread[2] - of the angle between the axis and any direction that a light faces
+    uint axis[2] - mean direction that the lights face, octahedral, 16 bits a coordinate
+    uint child[2] - index of a pair, or LEAF_BIT | index of a light; NO_LIGHT if there is none
+    """),
+)
+
+LIGHT_BOUNDS = Record(
+    "LightBounds",
+    "What both nodes of a LightPair have in common, to fit their parent.",
+    _fields("""
+    float low[3] - world, m
+    float power - as in LightPair
+    float high[3] - world, m
+    float spread - radians, as in LightPair
+    float axis[3] - unit
+    uint far - whether one of the lights is infinitely far
     """),
 )
 
@@ -347,6 +376,8 @@ RECORDS = (
     MATERIAL,
     TEXTURE,
     LIGHT,
+    LIGHT_PAIR,
+    LIGHT_BOUNDS,
     ENVIRONMENT_CELL,
     FILM_SUM,
     CELL_VERTEX,
@@ -393,6 +424,11 @@ PATH_FIELDS = (
 
 #: Words that only paths of some features have: (feature, least value of it, words).
 OPTIONAL_PATH_FIELDS = (
+    (
+        "LIGHT_SAMPLING",
+        1,
+        (("light_normal", "uint; packed: what the last light was chosen for, besides the origin"),),
+    ),
     (
         "CELLS",
         1,

@@ -43,7 +43,7 @@ def plan(context: Context) -> StageSpec:
         "camera",
         "paths start at the camera",
         "camera.cl",
-        flags=("LENS", "AOV_DIRECT", "CELLS"),
+        flags=("LENS", "AOV_DIRECT", "CELLS", "LIGHT_SAMPLING"),
         kernels=(kernel,),
         buffers=tuple(buffers),
     )

@@ -28,7 +28,7 @@ def plan(context: Context) -> StageSpec | None:
         "connect",
         "sampled lights need to be seen",
         "connect.cl",
-        flags=("FEW", "ALPHA", "VERTEX_COLORS", "AOV_DIRECT", "CELLS"),
+        flags=("FEW", "ALPHA", "VERTEX_COLORS", "AOV_DIRECT", "CELLS", "LIGHT_SAMPLING"),
         kernels=(kernel,),
         traces=True,
     )

@@ -51,7 +51,7 @@ def plan(context: Context) -> StageSpec:
         "film",
         "samples are summed pass by pass",
         "film.cl",
-        flags=("CELLS",),
+        flags=("CELLS", "LIGHT_SAMPLING"),
         kernels=tuple(kernels),
         buffers=tuple(buffers),
         per_pass=True,

@@ -20,7 +20,7 @@ def plan(context: Context) -> StageSpec:
         "intersect",
         "every ray needs its closest hit",
         "intersect.cl",
-        flags=("FEW", "ALPHA", "VERTEX_COLORS", "CELLS"),
+        flags=("FEW", "ALPHA", "VERTEX_COLORS", "CELLS", "LIGHT_SAMPLING"),
         kernels=(kernel,),
         traces=True,
     )

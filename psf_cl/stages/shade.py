@@ -39,6 +39,7 @@ def plan(context: Context) -> StageSpec:
             "ENVIRONMENT",
             "ALPHA",
             "CONNECT",
+            "LIGHT_SAMPLING",
             "AOV_DIRECT",
             "AOV_FEATURES",
             "CELLS",
@@ -57,7 +58,8 @@ def _kernel(context: Context) -> KernelSpec:
     shadow = ("shadow", "toward", "light") if context.on("CONNECT") else ()
     if cells == 2 and shadow:
         shadow += ("light_share",)
-    walk = ("status", "direction", "beta", "radiance", "pdf", *direct, *shared)
+    chosen = ("light_normal",) if context.on("LIGHT_SAMPLING") else ()
+    walk = ("status", "direction", "beta", "radiance", "pdf", *direct, *shared, *chosen)
     records = [layout.SURFACE, layout.MATERIAL]
     if context.on("SMOOTH"):
         records.append(layout.NORMALS)

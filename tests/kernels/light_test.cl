@@ -34,6 +34,8 @@ kernel void sample_lights(
     UInt unused_bits;
     UInt choice;
     sample_bits(seed, index, pair + PAIR_CHOICE, params->sampler, &unused_bits, &choice);
+    const LightChoice light = choose_light(params, lights, LOAD_U(active, 0) != 0u, LOAD_V(origin, 0),
+                                           LOAD_V(origin, 0), choice);
     const LightSample s = sample_light(params, lights, surfaces, materials,
 #if TEXTURES
                                        uvs, textures, texels, srgb_to_linear,
@@ -41,7 +43,7 @@ kernel void sample_lights(
 #if ENVIRONMENT == 2
                                        cells,
 #endif
-                                       LOAD_U(active, 0) != 0u, LOAD_V(origin, 0), seed, index, pair, choice);
+                                       LOAD_U(active, 0) != 0u, LOAD_V(origin, 0), seed, index, pair, light);
     store_vec3(toward, 0, s.toward);
     store_vec3(wi, 0, s.wi);
     store_vec3(radiance, 0, s.radiance);
@@ -54,7 +56,8 @@ kernel void list_densities(
     global const Light *lights, global const uint *light, global const float *hits, global float *pdfs)
 {
 #if AREA_LIGHTS
-    STORE(pdfs, 0, area_light_density(lights, LOAD_U(light, 0), LOAD(hits, 0), LOAD(hits, 1)));
+    const Float chance = GATHER(lights, LOAD_U(light, 0), pmf);
+    STORE(pdfs, 0, area_light_density(lights, LOAD_U(light, 0), chance, LOAD(hits, 0), LOAD(hits, 1)));
 #endif
 }
 
@@ -68,6 +71,7 @@ kernel void list_slots(global const uint *bits, global uint *slots, global float
 
 kernel void look_up_sky(
     global const Params *params,
+    global const Light *lights,
 #if ENVIRONMENT == 2
     global const EnvironmentCell *cells,
 #endif
@@ -81,7 +85,8 @@ kernel void look_up_sky(
 #if ENVIRONMENT == 2
                                         cells,
 #endif
-                                        LOAD_V(directions, 0), &pdf);
+                                        LOAD_V(directions, 0),
+                                        (Float)(lights[params->environment_light].pmf), &pdf);
     store_vec3(radiance, 0, value);
     STORE(pdfs, 0, pdf);
 #endif

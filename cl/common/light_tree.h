@@ -1,0 +1,147 @@
+// The tree of lights: a light is drawn for a point by what each part of the tree might bring there.
+//
+// Conty Estevez, Kulla: Importance Sampling of Many Lights with Adaptive Tree Splitting, 2018; bounds of
+// angles as in Pharr, Jakob, Humphreys: Physically Based Rendering, 4th edition, section 12.6.3.
+#pragma once
+
+#include "lanes.h"
+#include "layout.h"
+#include "rng.h"
+#include "unit_vector.h"
+
+/// A light and the chance that it is drawn; 0 in dead lanes.
+typedef struct {
+    UInt light;
+    Float pmf;
+} LightChoice;
+
+// Of two nodes that both may bring light, each is drawn at least this often: the other may be hidden.
+#define LEAST_LIGHT_SHARE 0x1p-10f
+// Sine of an angle beyond the horizon that still counts: normals and axes are rounded.
+#define HORIZON_SLACK 1e-3f
+
+#if LIGHT_SAMPLING
+/// Cosine of the angle a - b, of at least 0, and its sine.
+static inline Float cosine_of_difference(Float cos_a, Float sin_a, Float cos_b, Float sin_b, Float *sine)
+{
+    const Mask less = cos_a > cos_b;
+    *sine = pick(less, (Float)(0.0f), sin_a * cos_b - cos_a * sin_b);
+    return pick(less, (Float)(1.0f), cos_a * cos_b + sin_a * sin_b);
+}
+
+/// Bound of the light that node `side` of a pair, of this power, brings to a surface at `p` with normal
+/// `n`, unoccluded.
+static inline Float node_importance(
+    __global const LightPair *pairs, UInt pair, uint side, Float power, Vec3 p, Vec3 n)
+{
+    const Float radius = GATHER(pairs, pair, radius[side]);
+    const Vec3 center = vec3(GATHER(pairs, pair, center[side][0]), GATHER(pairs, pair, center[side][1]),
+                             GATHER(pairs, pair, center[side][2]));
+    const Vec3 axis = unpack_unit(GATHER_U(pairs, pair, axis[side]));
+    const Float cos_spread = GATHER(pairs, pair, cos_spread[side]);
+    const Float sin_spread = sqrt(max(1.0f - cos_spread * cos_spread, 0.0f));
+
+    const Vec3 toward = sub(center, p);
+    const Float d2 = dot3(toward, toward);
+    const Vec3 wi = normalize3(toward);
+    // The sphere hides an angle of up to half a turn, or everything from inside.
+    const Float share = min(radius * radius / max(d2, 1e-37f), (Float)(1.0f));
+    const Mask inside = share >= 1.0f;
+    const Float sin_sphere = pick(inside, (Float)(0.0f), sqrt(share));
+    const Float cos_sphere = pick(inside, (Float)(-1.0f), sqrt(1.0f - share));
+
+    const Float cos_axis = clamp(-dot3(axis, wi), (Float)(-1.0f), (Float)(1.0f));
+    const Float sin_axis = sqrt(1.0f - cos_axis * cos_axis);
+    Float sine;
+    Float cosine = cosine_of_difference(cos_axis, sin_axis, cos_spread, sin_spread, &sine);
+    const Float leaves = cosine_of_difference(cosine, sine, cos_sphere, sin_sphere, &sine);
+
+#if TRANSMISSION
+    const Float cos_normal = min(fabs(dot3(n, wi)), (Float)(1.0f));
+#else
+    const Float cos_normal = clamp(dot3(n, wi), (Float)(-1.0f), (Float)(1.0f));
+#endif
+    const Float sin_normal = sqrt(1.0f - cos_normal * cos_normal);
+    const Float falls =
+        cosine_of_difference(cos_normal, sin_normal, cos_sphere, sin_sphere, &sine) + HORIZON_SLACK;
+    const Float bound = power * max(leaves, 0.0f) * max(falls, 0.0f)
+                        / max(max(d2, radius * radius), 1e-37f);
+    return pick(radius < INFINITY, min(bound, 1e30f), power);
+}
+
+/// Chance that the left node of a pair is drawn.
+///
+/// Where the bound of the pair was too high and neither brings any light, their powers decide.
+LARGE_FUNCTION Float left_chance(__global const LightPair *pairs, UInt pair, Vec3 p, Vec3 n)
+{
+    const Float left_power = GATHER(pairs, pair, power[0]);
+    const Float right_power = GATHER(pairs, pair, power[1]);
+    Float left = node_importance(pairs, pair, 0u, left_power, p, n);
+    Float right = node_importance(pairs, pair, 1u, right_power, p, n);
+    const Mask dark = !(left + right > 0.0f);
+    left = pick(dark, left_power, left);
+    right = pick(dark, right_power, right);
+    const Mask both = (left > 0.0f) & (right > 0.0f);
+    const Float chance = left / pick(both, left + right, (Float)(1.0f));
+    const Float one = pick(right > 0.0f, (Float)(0.0f), (Float)(1.0f));
+    return pick(both, clamp(chance, (Float)(LEAST_LIGHT_SHARE), (Float)(1.0f - LEAST_LIGHT_SHARE)), one);
+}
+
+/// Draw a light for a surface at `p` with normal `n`.
+///
+/// The random number goes from node to node: what is left of it is uniform in the node that was drawn.
+/// Digits that it runs out of are made up.
+LARGE_FUNCTION LightChoice choose_in_tree(
+    __global const LightPair *pairs, uint light_count, Mask active, Vec3 p, Vec3 n, UInt bits)
+{
+    LightChoice choice;
+    choice.light = (UInt)(0u);
+    choice.pmf = pick(active, (Float)(1.0f), (Float)(0.0f));
+    UInt pair = (UInt)(0u);
+    Float u = unit_float(bits);
+    Mask inner = active;
+    // No tree is deeper than it has leaves.
+    for (uint level = 0; level <= light_count && any_lane(inner); ++level) {
+        const Float chance = left_chance(pairs, pair, p, n);
+        const Mask left = u < chance;
+        const Float share = pick(left, chance, 1.0f - chance);
+        choice.pmf = pick(inner, choice.pmf * share, choice.pmf);
+        const Float scale = 1.0f / max(share, 0x1p-30f);
+        bits = mix_bits(bits + 0x9e3779b9u);
+        const Float rest = (pick(left, u, u - chance) + 0x1p-24f * unit_float(bits)) * scale;
+        u = clamp(rest, (Float)(0.0f), (Float)(0x1.fffffep-1f));
+        const UInt child = pick_u(left, GATHER_U(pairs, pair, child[0]), GATHER_U(pairs, pair, child[1]));
+        const Mask leaf = child >= LEAF_BIT;
+        choice.light = pick_u(inner & leaf, child & ~LEAF_BIT, choice.light);
+        inner &= !leaf;
+        pair = pick_u(inner, child, (UInt)(0u));
+    }
+    return choice;
+}
+
+/// Chance with which choose_in_tree draws `light` at `p`.
+///
+/// `places`: 2 * pair + side of every light, then of every pair; NO_LIGHT for those that have none.
+LARGE_FUNCTION Float chance_in_tree(
+    __global const LightPair *pairs,
+    __global const uint *places,
+    uint light_count,
+    Mask active,
+    UInt light,
+    Vec3 p,
+    Vec3 n)
+{
+    UInt place = GATHER_WORD(places, pick_u(active, light, (UInt)(0u)));
+    Mask climbs = active & (place != NO_LIGHT);
+    Float pmf = pick(climbs, (Float)(1.0f), (Float)(0.0f));
+    for (uint level = 0; level <= light_count && any_lane(climbs); ++level) {
+        const UInt pair = pick_u(climbs, place >> 1, (UInt)(0u));
+        const Float chance = left_chance(pairs, pair, p, n);
+        const Float share = pick((place & 1u) == 0u, chance, 1.0f - chance);
+        pmf = pick(climbs, pmf * share, pmf);
+        place = GATHER_WORD(places, light_count + pair);
+        climbs &= place != NO_LIGHT;
+    }
+    return pmf;
+}
+#endif

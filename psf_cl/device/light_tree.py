@@ -1,0 +1,175 @@
+"""The tree of lights: joined by the builder of the BVH, with power and the directions they face."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from psf_cl.device.bvh import TreeBuild, warm_up_builder
+from psf_cl.device.device import Buffer, Device
+from psf_cl.device.layout import CONSTANT, LIGHT_BOUNDS, LIGHT_PAIR
+from psf_cl.device.program import Program, load_program
+
+_LEAF = CONSTANT["LEAF_BIT"]
+_NONE = CONSTANT["NO_LIGHT"]
+_FAR = (CONSTANT["LIGHT_ENVIRONMENT"], CONSTANT["LIGHT_DIRECTIONAL"])
+_GROUP = 64
+
+
+@dataclass(frozen=True)
+class Topology:
+    """Which nodes of the tree are siblings.
+
+    Attributes:
+        links: ``(p, 2)`` uint32, the children of each pair: another pair, or LEAF_BIT | light, or
+            NO_LIGHT.  Pair 0 is the root.
+        levels: the pairs of each level from the root down.
+        places: ``(lights + p,)`` uint32, 2 * pair + side of every light, then of every pair.
+    """
+
+    links: np.ndarray
+    levels: list[np.ndarray]
+    places: np.ndarray
+
+
+class LightTree:
+    """Buffers of the tree, by the names of the kernels' parameters; ``fit`` after lights moved."""
+
+    def __init__(
+        self,
+        device: Device,
+        table: np.ndarray,
+        lights: Buffer,
+        near_share: float,
+        radius: float,
+    ) -> None:
+        """Join ``table``, layout.LIGHT, which ``lights`` holds too, and fit the tree.
+
+        Args:
+            near_share: chance that a light is drawn that is not infinitely far, if there are both.
+            radius: of the scene, m.
+        """
+        self.device = device
+        self.program = _load(device)
+        topology = arrange(table, _join_near(device, table))
+        pairs = np.zeros(len(topology.links), LIGHT_PAIR.dtype)
+        pairs["child"] = topology.links
+        self.buffers = {
+            "light_pairs": device.upload("light_pairs", pairs),
+            "light_places": device.upload("light_places", topology.places),
+            "light_order": device.upload("light_order", np.concatenate(topology.levels)),
+            "light_bounds": device.allocate("light_bounds", LIGHT_BOUNDS.dtype, len(pairs)),
+        }
+        sizes = [len(level) for level in topology.levels]
+        self.levels = [(sum(sizes[:k]), size) for k, size in enumerate(sizes)]
+        # As far away as the scene is large, the brightest has 1: nothing over- or underflows.
+        largest = float(table["power"].max())
+        with np.errstate(over="ignore"):
+            unit = np.float32(radius) ** 2 / np.float32(largest) if largest > 0.0 else 1.0
+        self.launch = self.program.bind(
+            "fit_light_pairs",
+            lights=lights,
+            order=self.buffers["light_order"],
+            pairs=self.buffers["light_pairs"],
+            bounds=self.buffers["light_bounds"],
+            power_unit=float(np.clip(unit, 1e-30, 1e30)),
+            near_share=near_share,
+            level_start=0,
+            level_count=0,
+        )
+        self.fit()
+
+    def fit(self) -> None:
+        """Enqueue fitting every pair to the lights as they are now."""
+        for start, count in reversed(self.levels):
+            self.launch.set(level_start=start, level_count=count)(count, group=_GROUP)
+
+
+def warm_up_light_tree(device: Device) -> float:
+    """Make all kernels that build a tree of lights ready; return the seconds."""
+    start = time.perf_counter()
+    warm_up_builder(device)
+    _load(device).warm_up("fit_light_pairs")
+    return time.perf_counter() - start
+
+
+def _load(device: Device) -> Program:
+    return load_program(device, "light_tree.cl", {"W": 1})
+
+
+def _join_near(device: Device, table: np.ndarray) -> np.ndarray:
+    """Return the binary tree of the lights at finite distance, ``BINARY_NODE``, root last.
+
+    Its leaves name lights of ``table``; a light that is not finite is in none.
+    """
+    near = np.flatnonzero(~np.isin(table["kind"], _FAR)).astype(np.uint32)
+    corners = np.repeat(table["position"][near][:, None], 3, axis=1)
+    on_triangle = table["kind"][near] == CONSTANT["LIGHT_TRIANGLE"]
+    with np.errstate(over="ignore", invalid="ignore"):
+        for corner, edge in ((1, "e1"), (2, "e2")):
+            corners[on_triangle, corner] += table[edge][near][on_triangle]
+    if not len(near):
+        return np.zeros(0, [("left", np.uint32), ("right", np.uint32)])
+    positions = device.upload("positions", corners.astype(np.float32).reshape(-1))
+    build = TreeBuild(device, positions, len(near))
+    try:
+        build.sort_triangles()
+        build.join_clusters()
+        count = int(build.scalars["count"])
+        tree = device.read(build.own["tree"], max(2 * count - 1, 1))[: max(2 * count - 1, 0)]
+    finally:
+        build.release()
+        device.release(positions)
+    leaf = tree["right"] == _LEAF
+    tree["left"][leaf] = near[tree["left"][leaf]]
+    return tree[["left", "right"]]
+
+
+def arrange(table: np.ndarray, tree: np.ndarray) -> Topology:
+    """Number the pairs of the binary ``tree`` of near lights, and add the lights that are far.
+
+    Args:
+        tree: fields ``left`` and ``right``: nodes, or a light and LEAF_BIT; the root is last.
+    """
+    links: list[tuple[int, int]] = []
+    far = [_LEAF | int(i) for i in np.flatnonzero(np.isin(table["kind"], _FAR))]
+    roots = [*far]
+    while len(roots) > 1:
+        joined = []
+        for a, b in zip(roots[::2], roots[1::2], strict=False):
+            joined.append(len(links))
+            links.append((a, b))
+        roots = [*joined, *roots[2 * len(joined) :]]
+    count = (len(tree) + 1) // 2
+    if count:
+        start = len(links) - count
+        inner = tree[count:]
+        children = np.stack([inner["left"], inner["right"]], axis=1).astype(np.int64)
+        names = np.concatenate([_LEAF | tree["left"][:count].astype(np.int64), np.zeros(count - 1)])
+        names[count:] = start + np.arange(count, len(tree))
+        links += [(int(a), int(b)) for a, b in names.astype(np.int64)[children]]
+        roots.append(len(links) - 1 if count > 1 else int(names[0]))
+    if len(roots) == 2:
+        links.append((roots[1], roots[0]))
+    elif not roots or roots[0] >= _LEAF:
+        links.append((roots[0] if roots else _NONE, _NONE))
+    return _from_the_root(np.array(links, np.int64), len(table))
+
+
+def _from_the_root(links: np.ndarray, light_count: int) -> Topology:
+    """Return the pairs, whose last one is the root, numbered from it."""
+    pairs = len(links)
+    links = links[::-1]
+    links = np.where(links < _LEAF, pairs - 1 - links, links)
+    places = np.full(light_count + pairs, _NONE, np.uint32)
+    leaf = (links >= _LEAF) & (links != _NONE)
+    slots = 2 * np.arange(pairs)[:, None] + np.arange(2)
+    places[links[leaf] & ~_LEAF] = slots[leaf]
+    places[light_count + links[links < _LEAF]] = slots[links < _LEAF]
+    levels = [np.zeros(1, np.uint32)]
+    while len(levels[-1]):
+        children = links[levels[-1]].reshape(-1)
+        levels.append(children[children < _LEAF].astype(np.uint32))
+    return Topology(links.astype(np.uint32), levels[:-1], places)
