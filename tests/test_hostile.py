@@ -361,6 +361,16 @@ def assert_render_is_quiet(capfd, scene: str, note: str) -> None:
     assert np.isfinite(pixels).all() and pixels.max() > 1e10
 
 
+def test_a_note_on_a_name_with_a_line_break_is_still_one_line(folder, capfd):
+    document = triangle_gltf()
+    document["extensionsUsed"] = ["OTHER\nname"]
+    (folder / "a.glb").write_bytes(glb(document))
+    assert main(["plan", "a.glb"]) == 0
+    lines = capfd.readouterr().err.splitlines()
+    assert all(line.startswith("note: ") for line in lines)
+    assert "note: extensions are ignored: OTHER name" in lines
+
+
 def test_light_beyond_float32_in_an_mtl_file_is_limited_and_told(device, folder, capfd):
     (folder / "a.obj").write_text("mtllib a.mtl\n" + obj("usemtl lamp", "f 1 2 3"))
     (folder / "a.mtl").write_text("newmtl lamp\nKe 1e308 1e308 1\n")

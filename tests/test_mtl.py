@@ -72,6 +72,14 @@ def test_options_before_a_name_place_the_picture(tmp_path):
         assert (at_u, 1 - at_v) == pytest.approx((2 * u + 0.5, 3 * v + 0.25))
 
 
+@pytest.mark.filterwarnings("error")
+def test_numbers_beyond_float32_do_not_count(tmp_path):
+    picture(tmp_path, "a.png", [(1, 2, 3)])
+    scene = scene_of(tmp_path, "map_Kd -s 1e300 1 -o 1e39 a.png\nNi 1e99\nNs 1e39")
+    assert scene.textures[0].transform == (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+    assert scene.materials[0].ior == 1.5
+
+
 def test_pictures_of_light_and_opacity_are_read(tmp_path):
     picture(tmp_path, "glow.png", [(255, 0, 0)])
     picture(tmp_path, "holes.png", [(255, 255, 255), (0, 0, 0)])

@@ -228,9 +228,9 @@ def check_distinct(outputs: Iterable[str | Path], inputs: Iterable[str | Path | 
 
 
 def tell_notes(notes: Iterable[str]) -> None:
-    """Print what was assumed or left out."""
+    """Print what was assumed or left out, a line each: names in files may have line breaks."""
     for note in notes:
-        print(f"note: {note}", file=sys.stderr)
+        print(f"note: {' '.join(note.split())}", file=sys.stderr)
 
 
 def show(*renderables: RenderableType, file: TextIO | None = None) -> None:

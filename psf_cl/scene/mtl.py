@@ -7,6 +7,7 @@ extensions write them.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -40,6 +41,7 @@ _OPTIONS = {
 }
 #: Those whose words are numbers, of which the last ones may be left out.
 _NUMBERS = ("-mm", "-o", "-s", "-t")
+_LIKE_A_NUMBER = re.compile(r"[+-]?[\d.]+(?:[eE][+-]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -55,9 +57,9 @@ class Picture:
 
     def numbers(self, option: str, default: float, count: int = 1) -> list[float]:
         """Return ``count`` finite numbers of an option."""
-        words = self.options.get(option, [])[:count]
-        found = [number for number in map(_number, words) if number is not None]
-        return found + [default] * (count - len(found))
+        words = [*self.options.get(option, []), *[""] * count][:count]
+        found = [_number(word) for word in words]
+        return [default if number is None else number for number in found]
 
 
 @dataclass
@@ -288,7 +290,7 @@ def _picture(text: str) -> Picture:
             break
         end = at + 1
         while end < len(words) and end - at <= _OPTIONS[option]:
-            if option in _NUMBERS and _number(words[end]) is None:
+            if option in _NUMBERS and not _LIKE_A_NUMBER.fullmatch(words[end]):
                 break
             end += 1
         options[option] = words[at + 1 : end]
@@ -336,7 +338,8 @@ def _number(word: str) -> float | None:
         value = float(word)
     except ValueError:
         return None
-    return value if math.isfinite(value) else None
+    # On the device it is a float32.
+    return value if abs(value) <= MAX_RADIANCE else None
 
 
 def _at_most_1(color: tuple[float, float, float]) -> tuple[float, float, float]:
