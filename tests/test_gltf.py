@@ -24,6 +24,7 @@ from PIL import Image
 
 from psf_cl.errors import InputError
 from psf_cl.scene import gltf_draco
+from psf_cl.scene.animation import baked
 from psf_cl.scene.gltf import load_gltf
 from psf_cl.scene.gltf_material import film_reflectance
 from psf_cl.scene.model import Scene
@@ -558,17 +559,23 @@ def test_primitives_that_differ_in_material_alone_share_a_mesh(
     assert first.mesh is second.mesh and first.material != second.material
 
 
-def test_a_skinned_mesh_stands_in_its_bind_pose(builder: Builder, tmp_path: Path) -> None:
+def test_a_skinned_mesh_stands_where_its_joints_put_it(builder: Builder, tmp_path: Path) -> None:
     inverse_bind = np.diag([0.5, 0.5, 0.5, 1.0])
     inverse_bind[:3, 3] = [0, -1, 0]
-    joint = builder.node(translation=[0, 0, 7])
-    skin = builder.add(
-        "skins", joints=[joint], inverseBindMatrices=builder.accessor([inverse_bind.T.ravel()])
+    joints = [builder.node(translation=[0, 0, 7]), builder.node(translation=[4, 0, 0])]
+    binds = builder.accessor([inverse_bind.T.ravel(), np.eye(4).ravel()])
+    skin = builder.add("skins", joints=joints, inverseBindMatrices=binds)
+    mesh = builder.mesh(
+        [[2, 4, 6], [2, 4, 6], [0, 0, 0]],
+        JOINTS_0=builder.accessor([[0, 0, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0]], "u2"),
+        WEIGHTS_0=builder.accessor([[1, 0, 0, 0], [2, 0, 0, 0], [0.25, 0.75, 0, 0]]),
     )
-    builder.node(mesh=builder.mesh(), skin=skin, translation=[100, 100, 100])
-    scene = builder.load(tmp_path)
-    np.testing.assert_allclose(scene.shapes[0].transform @ [2, 4, 6, 1], [1, 1, 10, 1])
-    assert any("skins are left out" in note for note in scene.notes)
+    # The transform of its own node does not count.
+    builder.node(mesh=mesh, skin=skin, translation=[100, 100, 100])
+    (shape,) = baked(builder.load(tmp_path), None).shapes
+    expected = [[1, 1, 10], [6, 4, 6], [3, -0.25, 1.75]]
+    np.testing.assert_allclose(shape.mesh.positions, expected, atol=1e-6)
+    np.testing.assert_array_equal(shape.transform, np.eye(4))
 
 
 # Materials

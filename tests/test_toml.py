@@ -427,7 +427,29 @@ MISTAKES = [
     ),
     (
         '[[animation]]\ntarget = "a"\nproperty = "scale"\ntimes = [0, 1]\nvalues = [1, 2]\n',
-        "animation[0]: animation is not supported yet",
+        "animation[0].target: no shape is called 'a'",
+    ),
+    (
+        '[[animation]]\ntarget = "a"\nproperty = "scale"\ntimes = [0, 1]\nvalues = [1]\n',
+        "animation[0].values: expected one value a time, 2; got 1",
+    ),
+    (
+        '[[animation]]\ntarget = "a"\nproperty = "emission"\ntimes = [0]\nvalues = [1]\n',
+        "animation[0].values: expected for each time of emission: 3 numbers",
+    ),
+    (
+        '[[animation]]\ntarget = "a"\nproperty = "intensity"\ntimes = [0]\nvalues = [-1]\n',
+        "animation[0].values: expected numbers from 0 to 1e+20",
+    ),
+    (
+        '[[animation]]\ntarget = "a"\nproperty = "rotation"\ntimes = [0]\n'
+        "values = [[0, 0, 0, 0]]\n",
+        "animation[0].values: expected quaternions that are not zero",
+    ),
+    (
+        '[[animation]]\ntarget = "a"\nproperty = "position"\ntimes = [0]\nvalues = [[0, 0, 0]]\n'
+        "pivot = [0, 0, 0]\n",
+        "animation[0].pivot: is for rotation and scale",
     ),
     ("", "has no triangles"),
     ("x = " + "[" * 5000 + "]" * 5000, "not valid TOML"),

@@ -11,13 +11,20 @@ from __future__ import annotations
 import math
 import reprlib
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from psf_cl.errors import InputError
 from psf_cl.scene import gltf_draco
+from psf_cl.scene.gltf_animation import (
+    NodeCurves,
+    Rig,
+    read_curves,
+    read_joints,
+    read_morphs,
+)
 from psf_cl.scene.gltf_file import (
     FLOAT,
     QUANTISED_OR_FLOAT,
@@ -34,6 +41,7 @@ from psf_cl.scene.model import (
     Light,
     Material,
     Mesh,
+    Morphs,
     Scene,
     Shape,
 )
@@ -73,11 +81,15 @@ _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _GEOMETRY = ("attributes", "indices", "mode", "targets", "extensions")
 
 
-def load_gltf(path: Path) -> Scene:
+def load_gltf(path: Path, clip: str | None = None, animated: bool = False) -> Scene:
     """Return what the default scene of a .gltf or .glb shows; an empty one has no shapes.
 
     The materials are those in use, by first use.  Width and height follow the first camera's aspect
-    ratio; the environment is black.
+    ratio; the environment is black.  Skins and morph targets are for ``animation`` to apply.
+
+    Args:
+        clip: as in ``read_curves``.
+        animated: whether to read the animations.
 
     Raises:
         InputError: the file or a file it names cannot be read, is malformed where it is used, or
@@ -86,7 +98,7 @@ def load_gltf(path: Path) -> Scene:
     gltf = open_gltf(path)
     _check_version(gltf.root.item("asset"))
     _check_required(gltf.root)
-    return _Reader(gltf).scene(str(path))
+    return _Reader(gltf, clip, animated).scene(str(path))
 
 
 @dataclass
@@ -94,6 +106,8 @@ class _Reader:
     """The parts of the scene collected so far; materials and meshes are read at first use."""
 
     gltf: GltfFile
+    clip: str | None
+    animated: bool
     notes: Counter[str] = field(default_factory=Counter)
     extensions: set[str] = field(default_factory=set)
     cameras: list[Camera] = field(default_factory=list)
@@ -101,6 +115,7 @@ class _Reader:
     shapes: list[Shape] = field(default_factory=list)
     meshes: dict[int, list[tuple[Mesh, int | None]]] = field(default_factory=dict)
     primitives: dict[str, Mesh | None] = field(default_factory=dict)
+    unskinned: dict[int, Mesh] = field(default_factory=dict)
     aspect: float | None = None
     triangle_count: int = 0
 
@@ -115,10 +130,14 @@ class _Reader:
         children = [self.gltf.indices(node, "children", "nodes") for node in nodes]
         order, parents = _order_nodes(nodes, children)
         world = _world_transforms(nodes, order, parents)
+        curves: NodeCurves = {}
+        if self.animated:
+            curves = read_curves(self.gltf, self.clip, self.notes)
+        elif root.length("animations"):
+            self.notes["the file is animated: --frames renders it moving"] += 1
+        self.rig = Rig(self.gltf, nodes, parents, world, curves)
         for index in self._drawn_nodes(children, parents):
-            self._read_node(nodes[index], world[index], world)
-        if root.length("animations"):
-            self.notes["animations are left out: nodes stay where the file puts them"] += 1
+            self._read_node(index, world[index])
         if not self.shapes:
             self.notes["the default scene has no triangles"] += 1
         known = {*SUPPORTED, *([gltf_draco.EXTENSION] if gltf_draco.is_available() else [])}
@@ -141,6 +160,7 @@ class _Reader:
                 for text, count in self.notes.items()
             ),
             files=(path, *self.gltf.files),
+            nodes=tuple(self.rig.nodes),
         )
 
     def _drawn_nodes(self, children: list[list[int]], parents: list[int]) -> list[int]:
@@ -167,24 +187,26 @@ class _Reader:
                 pending.extend(reversed(children[index]))
         return list(drawn)
 
-    def _read_node(self, node: Item, transform: np.ndarray, world: list[np.ndarray]) -> None:
+    def _read_node(self, index: int, transform: np.ndarray) -> None:
+        node = self.rig.items[index]
         self.extensions.update(node.extension_names())
         camera_index = self.gltf.index(node, "camera", "cameras")
         if camera_index is not None:
-            self._read_camera(self.gltf.root.element("cameras", camera_index), node, transform)
+            camera = self.gltf.root.element("cameras", camera_index)
+            self._read_camera(camera, index, transform)
         light = node.extension("KHR_lights_punctual")
         if light is not None:
-            self._read_light(light, transform)
+            self._read_light(light, index, transform)
         mesh_index = self.gltf.index(node, "mesh", "meshes")
         if mesh_index is not None:
-            skin_index = self.gltf.index(node, "skin", "skins")
-            if skin_index is not None:
-                transform = self._bind_transform(skin_index, world)
-            self._place_mesh(mesh_index, node, transform)
+            self._place_mesh(mesh_index, index, transform)
+
+    def _moving_node(self, index: int) -> int:
+        return self.rig.node(index) if self.rig.moves(index) else -1
 
     # Cameras and lights
 
-    def _read_camera(self, camera: Item, node: Item, transform: np.ndarray) -> None:
+    def _read_camera(self, camera: Item, index: int, transform: np.ndarray) -> None:
         kind = camera.text("type")
         fov_y, height, aspect = Camera.fov_y, 0.0, None
         if kind == "orthographic":
@@ -207,8 +229,9 @@ class _Reader:
             return
         if not self.cameras:
             self.aspect = aspect
-        name = self._camera_name(node, camera)
-        self.cameras.append(Camera(pose, fov_y, name, height=height))
+        name = self._camera_name(self.rig.items[index], camera)
+        node = self._moving_node(index)
+        self.cameras.append(Camera(pose, fov_y, name, height=height, node=node))
 
     def _camera_name(self, node: Item, camera: Item) -> str:
         name = node.text("name", "") or camera.text("name", "") or "camera"
@@ -220,7 +243,7 @@ class _Reader:
             number += 1
         return unique
 
-    def _read_light(self, use: Item, transform: np.ndarray) -> None:
+    def _read_light(self, use: Item, node: int, transform: np.ndarray) -> None:
         """Add a light of KHR_lights_punctual; the scale of the node does not count."""
         table = self.gltf.root.extension("KHR_lights_punctual") or Item(use.file, "", {})
         index = use.integer("light")
@@ -257,26 +280,65 @@ class _Reader:
                 range=reach,
                 inner_angle=inner,
                 outer_angle=outer,
+                node=self._moving_node(node),
             )
         )
 
     # Meshes
 
-    def _place_mesh(self, mesh_index: int, node: Item, transform: np.ndarray) -> None:
-        item = self.gltf.root.element("meshes", mesh_index)
+    def _place_mesh(self, mesh_index: int, index: int, transform: np.ndarray) -> None:
+        item, node = self.gltf.root.element("meshes", mesh_index), self.rig.items[index]
         if mesh_index not in self.meshes:
             self.meshes[mesh_index] = self._read_mesh(item)
         name = node.text("name", "") or item.text("name", "") or node.place
+        skin_index = self.gltf.index(node, "skin", "skins")
         instancing = node.extension("EXT_mesh_gpu_instancing")
-        places = [transform]
+        places = [np.eye(4)]
         if instancing is not None:
             places = _instances(self.gltf, instancing, transform)
         meshes = self.meshes[mesh_index]
         if len(self.shapes) + len(places) * len(meshes) > MAX_SHAPES:
             node.fail("mesh", f"at most {MAX_SHAPES} primitives in all nodes together")
         for mesh, material_index in meshes:
-            material = self.materials.index_of(material_index)
-            self.shapes.extend(Shape(name, mesh, place, material) for place in places)
+            shape = Shape(name, mesh, transform, self.materials.index_of(material_index))
+            if mesh.joints is not None and skin_index is not None:
+                self._place_skinned(shape, index, skin_index)
+                continue
+            if mesh.joints is not None:
+                shape = replace(shape, mesh=self._without_joints(mesh))
+            elif skin_index is not None:
+                self.notes["skins of meshes without joints are ignored"] += 1
+            if mesh.morphs is not None or self.rig.moves(index):
+                shape = replace(shape, node=self.rig.node(index))
+            self.shapes.extend(
+                self._placed(shape, place, instancing is not None) for place in places
+            )
+
+    def _placed(self, shape: Shape, place: np.ndarray, is_instance: bool) -> Shape:
+        """Return one instance of ``shape``, or the shape where it is if there are none."""
+        if not is_instance:
+            return shape
+        world = shape.transform @ place
+        if shape.node >= 0:
+            return replace(shape, transform=world, node=self.rig.child(shape.node, place))
+        return replace(shape, transform=world)
+
+    def _place_skinned(self, shape: Shape, index: int, skin_index: int) -> None:
+        """Add a shape that its joints place: the transform of its own node does not count."""
+        skin = self.rig.skin(skin_index)
+        mesh = shape.mesh
+        if mesh.joints is not None and mesh.joints.max(initial=0) >= len(skin.joints):
+            count = len(skin.joints)
+            self.gltf.root.element("skins", skin_index).fail(
+                "joints", f"more than {mesh.joints.max()} nodes, as JOINTS_0 asks for", str(count)
+            )
+        node = self.rig.node(index) if mesh.morphs is not None else -1
+        self.shapes.append(replace(shape, transform=np.eye(4), node=node, skin=skin))
+
+    def _without_joints(self, mesh: Mesh) -> Mesh:
+        if id(mesh) not in self.unskinned:
+            self.unskinned[id(mesh)] = replace(mesh, joints=None, weights=None)
+        return self.unskinned[id(mesh)]
 
     def _read_mesh(self, item: Item) -> list[tuple[Mesh, int | None]]:
         """Return the triangle meshes of all primitives with their material indices in the file."""
@@ -330,10 +392,8 @@ class _Reader:
             if values is not None and len(values) != len(positions):
                 expected = f"as many elements as POSITION, {len(positions)}"
                 attributes.fail(key, expected, str(len(values)))
-        if "JOINTS_0" in attributes:
-            self.notes["the vertex attribute JOINTS_0 is ignored"] += 1
-        if primitive.length("targets"):
-            self.notes["morph targets are left out: meshes keep their base form"] += 1
+        joints, weights = read_joints(self.gltf, attributes, len(positions)) or (None, None)
+        morphs = read_morphs(self.gltf, primitive, len(positions))
         triangles = self._triangles(primitive, mode, len(positions))
         if len(triangles) == 0:
             return None
@@ -348,10 +408,11 @@ class _Reader:
             # Primitives often share one large vertex buffer: keep what each needs.
             triangles = (np.cumsum(used) - 1)[triangles]
             positions = positions[used]
-            normals, uvs, uvs1, tangents, colors = (
+            normals, uvs, uvs1, tangents, colors, joints, weights = (
                 None if values is None else values[used]
-                for values in (normals, uvs, uvs1, tangents, colors)
+                for values in (normals, uvs, uvs1, tangents, colors, joints, weights)
             )
+            morphs = morphs and _used_morphs(morphs, used)
         if normals is not None:
             normals = _unit_normals(normals, positions, triangles)
         uvs, uvs1, tangents = (
@@ -359,7 +420,17 @@ class _Reader:
             for values in (uvs, uvs1, tangents)
         )
         return Mesh(
-            name, positions, triangles.astype(np.uint32), normals, uvs, uvs1, colors, tangents
+            name,
+            positions,
+            triangles.astype(np.uint32),
+            normals,
+            uvs,
+            uvs1,
+            colors,
+            tangents,
+            morphs,
+            joints,
+            weights,
         )
 
     def _colors(self, attributes: Item) -> np.ndarray | None:
@@ -388,27 +459,6 @@ class _Reader:
         if len(indices) < 3 or (mode == _TRIANGLES and len(indices) % 3):
             self.notes["indices that make no whole triangle are left out"] += 1
         return _assemble_triangles(indices, mode)
-
-    def _bind_transform(self, skin_index: int, world: list[np.ndarray]) -> np.ndarray:
-        """Return where the first joint of a skin puts the whole mesh.
-
-        In the bind pose all joints agree; the transform of the mesh's own node does not count
-        (section 3.7.3.3).
-        """
-        self.notes["skins are left out: meshes stand as their first joint places them"] += 1
-        skin = self.gltf.root.element("skins", skin_index)
-        joints = self.gltf.indices(skin, "joints", "nodes")
-        if not joints:
-            skin.fail("joints", "at least one node")
-        transform = world[joints[0]]
-        stored = self.gltf.accessor(skin, "inverseBindMatrices", "MAT4", FLOAT)
-        if stored is not None:
-            with np.errstate(over="ignore", invalid="ignore"):
-                transform = transform @ stored[0].reshape(4, 4).T.astype(float)
-            transform[3] = (0.0, 0.0, 0.0, 1.0)
-            if not np.isfinite(transform).all():
-                skin.fail("inverseBindMatrices", "an accessor of finite matrices")
-        return transform
 
 
 def _check_version(asset: Item) -> None:
@@ -493,7 +543,7 @@ def _local_transform(node: Item) -> np.ndarray:
 
 
 def _instances(gltf: GltfFile, instancing: Item, transform: np.ndarray) -> list[np.ndarray]:
-    """Return where EXT_mesh_gpu_instancing puts a mesh, ``(4, 4)`` float64 each."""
+    """Return where EXT_mesh_gpu_instancing puts a mesh in its node, ``(4, 4)`` float64 each."""
     attributes = instancing.item("attributes")
     components = (*FLOAT, 5120, 5122)
     moves, turns, scales = (
@@ -521,7 +571,12 @@ def _instances(gltf: GltfFile, instancing: Item, transform: np.ndarray) -> list[
         places = transform @ local
     if not np.isfinite(places).all():
         instancing.fail("attributes", "accessors of finite transforms", "one that is not")
-    return list(places)
+    return list(local)
+
+
+def _used_morphs(morphs: Morphs, used: np.ndarray) -> Morphs:
+    parts = (morphs.positions, morphs.normals, morphs.tangents)
+    return Morphs(*(None if part is None else part[:, used] for part in parts))
 
 
 def _assemble_triangles(indices: np.ndarray, mode: int) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 
 from psf_cl.errors import InputError
 from psf_cl.scene import mesh, transform
+from psf_cl.scene.animation import baked, settled
 from psf_cl.scene.environment import load_environment
 from psf_cl.scene.gltf import load_gltf
 from psf_cl.scene.model import (
@@ -40,6 +41,9 @@ def load_scene(
     environment: str | Path | None = None,
     camera: str | None = None,
     size: tuple[int, int] | None = None,
+    clip: str | None = None,
+    time: float | None = None,
+    moving: bool = False,
 ) -> Scene:
     """Read a scene and complete it, so that it has triangles, a camera and light.
 
@@ -50,13 +54,22 @@ def load_scene(
         environment: an .exr or .hdr file to use instead of the scene's environment.
         camera: name of the camera to use.
         size: width and height in pixels instead of the scene's.
+        clip: name or number of the animation of a glTF file to play; see ``read_curves``.
+        time: s; the scene is as its animations have it then.  None for rest, as if it had none.
+        moving: whether to keep what moves for a sequence of frames; else all stands still.
 
     Raises:
-        InputError: missing, unknown or malformed file, no triangles or too many, no camera of that
-            name, or a size out of range.
+        InputError: missing, unknown or malformed file, no triangles or too many, no camera or
+            animation of that name, or a size out of range.
     """
     path = Path(path)
-    scene = load_toml(path, _load_mesh_file) if _suffix(path) == ".toml" else _load_mesh_file(path)
+    animated = moving or time is not None
+
+    def load_mesh_file(path: Path) -> Scene:
+        return _load_mesh_file(path, clip, animated)
+
+    is_toml = _suffix(path) == ".toml"
+    scene = load_toml(path, load_mesh_file) if is_toml else load_mesh_file(path)
     count = sum(len(shape.mesh.triangles) for shape in scene.shapes)
     if count == 0:
         raise InputError(f"{path} has no triangles")
@@ -70,7 +83,9 @@ def load_scene(
             notes=scene.notes + notes,
             files=(*scene.files, str(environment)),
         )
-    return _without_unused(_with_light(_with_camera(_with_size(scene, size), camera)))
+    scene = _with_light(_with_camera(_with_size(scene, size), camera, time))
+    scene = settled(scene) if moving else baked(scene, time)
+    return _without_unused(scene)
 
 
 def _suffix(path: Path) -> str:
@@ -80,11 +95,11 @@ def _suffix(path: Path) -> str:
     return suffix
 
 
-def _load_mesh_file(path: Path) -> Scene:
+def _load_mesh_file(path: Path, clip: str | None, animated: bool) -> Scene:
     suffix = path.suffix.lower()
     if suffix not in _MESH_FILES:
         raise InputError(f"{path}: expected a file ending in {', '.join(_MESH_FILES)}")
-    return load_gltf(path) if suffix in _GLTF else mesh.load_mesh_scene(path)
+    return load_gltf(path, clip, animated) if suffix in _GLTF else mesh.load_mesh_scene(path)
 
 
 def _with_size(scene: Scene, size: tuple[int, int] | None) -> Scene:
@@ -96,7 +111,7 @@ def _with_size(scene: Scene, size: tuple[int, int] | None) -> Scene:
     return replace(scene, width=width, height=height)
 
 
-def _with_camera(scene: Scene, name: str | None) -> Scene:
+def _with_camera(scene: Scene, name: str | None, time: float | None) -> Scene:
     if name is not None:
         names = [camera.name for camera in scene.cameras]
         if not name or name not in names:
@@ -109,7 +124,8 @@ def _with_camera(scene: Scene, name: str | None) -> Scene:
     if scene.cameras:
         return scene
     note = "the file has no camera: the view frames the whole scene"
-    return replace(scene, cameras=(framing_camera(scene),), camera=0, notes=(*scene.notes, note))
+    view = framing_camera(baked(scene, time))
+    return replace(scene, cameras=(view,), camera=0, notes=(*scene.notes, note))
 
 
 def framing_camera(scene: Scene) -> Camera:
@@ -189,9 +205,13 @@ def _without_unused(scene: Scene) -> Scene:
 def _without_idle_textures(material: Material) -> Material:
     """Return ``material`` without the textures of what it has not."""
     for strength, names in _TEXTURES_OF.items():
-        if not np.any(getattr(material, strength)):
+        if not np.any(getattr(material, strength)) and not _is_animated(material, strength):
             material = replace(material, **dict.fromkeys(names, -1))
     return material
+
+
+def _is_animated(material: Material, strength: str) -> bool:
+    return strength == "emission" and material.emission_curve is not None
 
 
 # A texture multiplies: where this is 0 those have no say.

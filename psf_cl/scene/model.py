@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from psf_cl.scene.curve import Curve
+
 #: Triangles that a scene may have.  A file's size does not bound them: one mesh has many places.
 MAX_TRIANGLES = 1 << 27
 
@@ -78,6 +80,7 @@ class Material:
         emission: radiance (emissive factor times strength).
         double_sided: whether both sides *emit*; surfaces always reflect on both sides.
         unlit: whether to show the base colour as it is, without light.
+        emission_curve: what ``emission`` becomes over time, or None.
     """
 
     name: str = "default"
@@ -116,6 +119,7 @@ class Material:
     emission_texture: int = -1
     double_sided: bool = False
     unlit: bool = False
+    emission_curve: Curve | None = None
 
 
 #: The parameters of a material that are textures.
@@ -130,6 +134,50 @@ COLOR_TEXTURES = (
 )
 
 
+@dataclass(frozen=True, eq=False)
+class Node:
+    """A place that moves, in the space of another one.
+
+    Attributes:
+        parent: index into ``Scene.nodes``, less than its own; -1 for the world.
+        translation, rotation, scale: at rest; rotation is a quaternion (x, y, z, w).
+        matrix: ``(4, 4)`` float64 instead of these three, or None.
+        weights: of the morph targets, at rest.
+        curves: by name (translation, rotation, scale, weights), what these become over time; a
+            rotation of three numbers is in degrees about X, then Y, then Z.
+    """
+
+    parent: int = -1
+    translation: tuple[float, ...] = (0.0, 0.0, 0.0)
+    rotation: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
+    scale: tuple[float, ...] = (1.0, 1.0, 1.0)
+    matrix: np.ndarray | None = None
+    weights: tuple[float, ...] = ()
+    curves: dict[str, Curve] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """What moves the vertices of a mesh with joints.
+
+    Attributes:
+        joints: indices into ``Scene.nodes``.
+        inverse_bind: ``(j, 4, 4)`` float64, from the mesh's space to each joint's.
+    """
+
+    joints: tuple[int, ...]
+    inverse_bind: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Morphs:
+    """Other forms of a mesh, as differences: ``(t, n, 3)`` float32 each, or None for no change."""
+
+    positions: np.ndarray | None
+    normals: np.ndarray | None
+    tangents: np.ndarray | None
+
+
 @dataclass(frozen=True)
 class Mesh:
     """Triangles in their own space.
@@ -142,6 +190,9 @@ class Mesh:
         colors: ``(n, 4)`` float32, linear RGB and alpha that multiply the base colour, or None.
         tangents: ``(n, 4)`` float32: where u grows, and 1 or -1, the sign of the bitangent that is
             normal x tangent; None to derive them from the normal map's coordinates.
+        morphs: what the weights of ``Shape.node`` add, or None.
+        joints, weights: ``(n, k)`` uint32 and float32 (each row's sum is 1): how far each joint of
+            ``Shape.skin`` moves a vertex; None without a skin.
     """
 
     name: str
@@ -152,6 +203,9 @@ class Mesh:
     uvs1: np.ndarray | None = None
     colors: np.ndarray | None = None
     tangents: np.ndarray | None = None
+    morphs: Morphs | None = None
+    joints: np.ndarray | None = None
+    weights: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -162,12 +216,16 @@ class Shape:
         transform: ``(4, 4)`` float64, object to world, column vectors (``world = M @ object``).
             A negative determinant mirrors the mesh: its front stays the front.
         material: index into ``Scene.materials``.
+        node: index into ``Scene.nodes`` of what the transform follows over time; -1 for none.
+        skin: what moves the vertices instead of the transform, or None.
     """
 
     name: str
     mesh: Mesh
     transform: np.ndarray
     material: int
+    node: int = -1
+    skin: Skin | None = None
 
 
 @dataclass(frozen=True)
@@ -181,6 +239,8 @@ class Light:
         direction: ``(3,)`` unit, the way the light travels; unused by point.
         range: meters at which the light has faded out as KHR_lights_punctual says; inf for none.
         inner_angle, outer_angle: half angles of the cone, radians.
+        node: index into ``Scene.nodes`` of what position and direction (its -Z) follow; -1: none.
+        intensity_curve: what ``intensity`` becomes over time, or None.
     """
 
     kind: str
@@ -191,6 +251,8 @@ class Light:
     range: float = float("inf")
     inner_angle: float = 0.0
     outer_angle: float = 0.7853981633974483
+    node: int = -1
+    intensity_curve: Curve | None = None
 
 
 @dataclass(frozen=True)
@@ -210,6 +272,15 @@ class Environment:
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
 
 
+@dataclass(frozen=True, eq=False)
+class View:
+    """Where a camera is over time, by two points."""
+
+    position: Curve
+    target: Curve
+    up: tuple[float, float, float]
+
+
 @dataclass(frozen=True)
 class Camera:
     """A perspective or orthographic camera; it looks along its local -Z, its local +Y is up.
@@ -221,6 +292,8 @@ class Camera:
         focus_distance: meters along the view direction that are sharp; used if lens_radius > 0.
         height: meters from the bottom of the film to its top if rays are parallel, which start in
             the camera's plane and know no lens; 0 if they start in a point.
+        node: index into ``Scene.nodes`` of what the transform follows over time; -1 for none.
+        view: what the transform becomes over time instead, or None.
     """
 
     transform: np.ndarray
@@ -229,6 +302,8 @@ class Camera:
     lens_radius: float = 0.0
     focus_distance: float = 1.0
     height: float = 0.0
+    node: int = -1
+    view: View | None = None
 
 
 @dataclass(frozen=True)
@@ -242,6 +317,7 @@ class Scene:
         render: the ``[render]`` table, unchecked (``settings.resolve`` checks it).
         notes: what the reader assumed or left out, one sentence each, to be told to the user.
         files: every file that was read for it.
+        nodes: what things move with.
     """
 
     path: str
@@ -257,6 +333,7 @@ class Scene:
     render: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     files: tuple[str, ...] = ()
+    nodes: tuple[Node, ...] = ()
 
 
 def limited(radiance: Iterable[float]) -> tuple[float, float, float]:
@@ -266,8 +343,10 @@ def limited(radiance: Iterable[float]) -> tuple[float, float, float]:
 
 
 def emits(material: Material) -> bool:
-    """Return whether ``material`` is a light."""
-    return max(material.emission) > 0.0 and not material.unlit
+    """Return whether ``material`` is a light, if not now then at another time."""
+    return (max(material.emission) > 0.0 or material.emission_curve is not None) and (
+        not material.unlit
+    )
 
 
 def is_cut_out(material: Material, mesh: Mesh | None = None) -> bool:
@@ -311,8 +390,8 @@ def has_layers(material: Material) -> bool:
 
 
 def shines(light: Light) -> bool:
-    """Return whether ``light`` gives any light."""
-    return max(light.intensity) > 0.0
+    """Return whether ``light`` gives any light, if not now then at another time."""
+    return max(light.intensity) > 0.0 or light.intensity_curve is not None
 
 
 def has_environment(environment: Environment) -> bool:

@@ -6,7 +6,6 @@ records from values that are already known to be sound.
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 import tomllib
@@ -20,6 +19,7 @@ import numpy as np
 from psf_cl.errors import InputError
 from psf_cl.files import read_file
 from psf_cl.scene import transform
+from psf_cl.scene.curve import Curve
 from psf_cl.scene.environment import load_environment
 from psf_cl.scene.model import (
     COLOR_TEXTURES,
@@ -30,9 +30,12 @@ from psf_cl.scene.model import (
     Light,
     Material,
     Mesh,
+    Node,
     Scene,
     Shape,
+    Skin,
     Texture,
+    View,
 )
 from psf_cl.scene.primitives import PRIMITIVES
 from psf_cl.scene.schema import (
@@ -45,13 +48,13 @@ from psf_cl.scene.schema import (
     matrix,
     number,
     read_table,
-    several,
     table,
     tables,
     text,
     vector,
 )
 from psf_cl.scene.texture import load_texture
+from psf_cl.scene.toml_animation import Animations, read_animations
 
 MAX_SIZE = 16384
 MAX_LENGTH = 1e18
@@ -163,16 +166,6 @@ LIGHT: Schema = {
     "outer_angle": Key(number(above=0, high=90), "half angle of the whole cone, degrees"),
 }
 
-ANIMATION: Schema = {
-    "target": Key(text(), "name of a shape, light, material or camera", required=True),
-    "property": Key(
-        text("translation", "rotation", "scale", "emission", "intensity"), required=True
-    ),
-    "times": Key(several(number(0)), "seconds", required=True),
-    "values": Key(several(either(number(), vector(3), vector(4))), "one a time", required=True),
-    "interpolation": Key(text("step", "linear", "cubic")),
-}
-
 # Which keys a light of a type must have, and which it may have besides those of all types.
 _LIGHT_KEYS = {
     "point": ({"position"}, {"range"}),
@@ -193,17 +186,18 @@ def load_toml(path: Path, load_mesh_file: Callable[[Path], Scene]) -> Scene:
     """
     place = Place(str(path))
     raw = read_table(_parse(path), SCENE, place)
-    assembly = _Assembly(path.parent, load_mesh_file)
-    _refuse_animation(raw.get("animation", []), place.key("animation"))
+    animations = read_animations(raw.get("animation", []), place.key("animation"))
+    assembly = _Assembly(path.parent, load_mesh_file, animations)
     film = read_table(raw.get("film", {}), FILM, place.key("film"))
     _read_materials(raw.get("materials", {}), place.key("materials"), assembly)
     for index, shape in enumerate(raw.get("shapes", [])):
         _read_shape(shape, place.key("shapes").item(index), assembly)
     lights = place.key("lights")
     for index, light in enumerate(raw.get("lights", [])):
-        assembly.lights.append(_read_light(light, lights.item(index)))
+        assembly.lights.append(_read_light(light, lights.item(index), assembly))
     environment = _read_environment(raw.get("environment", {}), place.key("environment"), assembly)
     cameras = _read_cameras(raw, place, assembly)
+    animations.check_all_used()
     for name in assembly.overrides.keys() - assembly.used_overrides:
         assembly.notes.append(f"nothing in {path} uses the material {name}")
     return Scene(
@@ -218,6 +212,7 @@ def load_toml(path: Path, load_mesh_file: Callable[[Path], Scene]) -> Scene:
         render=raw.get("render", {}),
         notes=tuple(assembly.notes),
         files=(str(path), *assembly.read_files),
+        nodes=tuple(animations.nodes),
     )
 
 
@@ -245,6 +240,7 @@ class _Assembly:
 
     folder: Path
     load_mesh_file: Callable[[Path], Scene]
+    animations: Animations
     textures: list[Texture] = field(default_factory=list)
     materials: list[Material] = field(default_factory=list)
     shapes: list[Shape] = field(default_factory=list)
@@ -340,6 +336,8 @@ def _read_materials(raw: dict[str, Any], place: Place, assembly: _Assembly) -> N
                 )
         if "anisotropy_rotation" in changes:
             changes["anisotropy_rotation"] = math.radians(changes["anisotropy_rotation"])
+        for track in assembly.animations.of("material", name).values():
+            changes["emission_curve"] = track.curve
         assembly.overrides[name] = changes
 
 
@@ -391,12 +389,15 @@ def _read_shape(raw: dict[str, Any], place: Place, assembly: _Assembly) -> None:
             raise place.key("material").error(f"no [materials.{name}] in this file; known: {known}")
         own = assembly.own_material(name)
 
+    tracks = assembly.animations.of("shape", shape.get("name"))
+    root = assembly.animations.placed(tracks, matrix_of_shape)
     if "primitive" in shape:
         name = shape["primitive"]
         parts = [Shape(name, assembly.primitive(name), np.eye(4), 0)]
         indices = [assembly.own_material(Material().name) if own is None else own]
     else:
         scene, indices = assembly.mesh_file(shape["mesh"], place.key("mesh"))
+        scene = _below(scene, root, matrix_of_shape, assembly.animations)
         parts = list(scene.shapes)
         assembly.lights.extend(_moved_light(light, matrix_of_shape) for light in scene.lights)
         for camera in scene.cameras:
@@ -404,6 +405,8 @@ def _read_shape(raw: dict[str, Any], place: Place, assembly: _Assembly) -> None:
     changes: dict[str, Any] = {}
     if "emission" in shape:
         changes = {"emission": shape["emission"], "emission_texture": -1, "double_sided": False}
+    if "emission" in tracks:
+        changes |= {"emission_texture": -1, "emission_curve": tracks["emission"].curve}
     if "two_sided" in shape:
         changes["double_sided"] = shape["two_sided"]
     for part in parts:
@@ -414,10 +417,58 @@ def _read_shape(raw: dict[str, Any], place: Place, assembly: _Assembly) -> None:
             Shape(
                 name=shape.get("name", part.name),
                 mesh=part.mesh,
-                transform=matrix_of_shape @ part.transform,
+                # Joints put vertices into the world.
+                transform=np.eye(4) if part.skin else matrix_of_shape @ part.transform,
                 material=material,
+                node=root if part.node < 0 and "primitive" in shape else part.node,
+                skin=part.skin,
             )
         )
+
+
+def _below(scene: Scene, root: int, matrix: np.ndarray, animations: Animations) -> Scene:
+    """Return the scene of a mesh file with its nodes among those of the scene it is part of.
+
+    Args:
+        root: the node that moves all of the file; -1 if it stands at ``matrix``.
+    """
+    if root < 0 and not scene.nodes:
+        return scene
+    if root < 0:
+        root = animations.add(Node(matrix=matrix))
+        is_moving = False
+    else:
+        is_moving = True
+    start = len(animations.nodes)
+    for node in scene.nodes:
+        parent = root if node.parent < 0 else start + node.parent
+        animations.add(replace(node, parent=parent))
+    skins: dict[int, Skin] = {}
+
+    def follow(node: int, place: np.ndarray) -> int:
+        if node >= 0:
+            return start + node
+        return animations.add(Node(root, matrix=place)) if is_moving else -1
+
+    shapes = []
+    for shape in scene.shapes:
+        if shape.skin is not None:
+            joints = tuple(start + joint for joint in shape.skin.joints)
+            skins.setdefault(id(shape.skin), Skin(joints, shape.skin.inverse_bind))
+            node = start + shape.node if shape.node >= 0 else -1
+            shapes.append(replace(shape, node=node, skin=skins[id(shape.skin)]))
+        else:
+            shapes.append(replace(shape, node=follow(shape.node, shape.transform)))
+    return replace(
+        scene,
+        shapes=tuple(shapes),
+        cameras=tuple(
+            replace(camera, node=follow(camera.node, camera.transform)) for camera in scene.cameras
+        ),
+        lights=tuple(
+            replace(light, node=follow(light.node, _light_matrix(light))) for light in scene.lights
+        ),
+    )
 
 
 def _read_transform(steps: list[dict[str, Any]], place: Place) -> np.ndarray:
@@ -470,7 +521,16 @@ def _moved_camera(camera: Camera, matrix_of_shape: np.ndarray, place: Place) -> 
     return replace(camera, transform=moved)
 
 
-def _read_light(raw: dict[str, Any], place: Place) -> Light:
+def _light_matrix(light: Light) -> np.ndarray:
+    """Return a matrix that puts a light at its position and its -Z along its direction."""
+    position, direction = np.array(light.position), np.array(light.direction)
+    up = (1.0, 0.0, 0.0) if abs(direction[1]) > 0.9 else (0.0, 1.0, 0.0)
+    matrix = transform.look_at((0.0, 0.0, 0.0), direction, up)
+    matrix[:3, 3] = position
+    return matrix
+
+
+def _read_light(raw: dict[str, Any], place: Place, assembly: _Assembly) -> Light:
     light = read_table(raw, LIGHT, place)
     kind = light.pop("type")
     needed, more = _LIGHT_KEYS[kind]
@@ -491,7 +551,17 @@ def _read_light(raw: dict[str, Any], place: Place) -> Light:
                 f"expected less than outer_angle, {outer:g} degrees; got {inner:g}"
             )
         light |= {"inner_angle": math.radians(inner), "outer_angle": math.radians(outer)}
-    return Light(kind=kind, intensity=_triple(values), **light)
+    read = Light(kind=kind, intensity=_triple(values), **light)
+    tracks = assembly.animations.of("light", read.name or None)
+    node = assembly.animations.placed(tracks, _light_matrix(read))
+    if "position" in tracks:
+        if node >= 0:
+            raise tracks["position"].place.error("expected either position or translation")
+        moved = assembly.animations.add(Node(curves={"translation": tracks["position"].curve}))
+        matrix = _light_matrix(replace(read, position=(0.0, 0.0, 0.0)))
+        node = assembly.animations.add(Node(moved, matrix=matrix))
+    curve = tracks["intensity"].curve.scaled(color) if "intensity" in tracks else None
+    return replace(read, node=node, intensity_curve=curve)
 
 
 def _read_environment(raw: dict[str, Any], place: Place, assembly: _Assembly) -> Environment:
@@ -548,6 +618,8 @@ def _read_cameras(raw: dict[str, Any], place: Place, assembly: _Assembly) -> tup
 
 def _read_camera(raw: dict[str, Any], place: Place, assembly: _Assembly) -> Camera:
     values = read_table(raw, CAMERA, place)
+    # The one camera of a scene may do without a name.
+    tracks = assembly.animations.of("camera", values.get("name", "camera"))
     kept = ("name", "lens_radius", "focus_distance")
     changes = {key: values[key] for key in kept if key in values}
     if "fov_y" in values:
@@ -558,6 +630,8 @@ def _read_camera(raw: dict[str, Any], place: Place, assembly: _Assembly) -> Came
                 raise place.key(key).error("expected either from or position, target and up")
         for camera in assembly.file_cameras:
             if camera.name == values["from"]:
+                for track in tracks.values():
+                    raise track.place.error("a camera of a mesh file moves as the file says")
                 return replace(camera, **changes)
         known = ", ".join(repr(camera.name) for camera in assembly.file_cameras) or "none"
         raise place.key("from").error(f"no camera {values['from']!r} in the meshes; known: {known}")
@@ -571,17 +645,17 @@ def _read_camera(raw: dict[str, Any], place: Place, assembly: _Assembly) -> Came
         raise place.error(f"position, target and up do not make a view: {error}") from None
     sharp = float(np.linalg.norm(target - position))
     defaults = {"transform": view, "fov_y": math.radians(45), "focus_distance": sharp}
+    changes["node"] = assembly.animations.placed(tracks, view)
+    if "position" in tracks or "target" in tracks:
+        if changes["node"] >= 0:
+            raise place.error("animated: expected either position and target, or translation")
+        still = {"position": position, "target": target}
+        curves = [
+            tracks[name].curve if name in tracks else Curve(np.zeros(1), point[None])
+            for name, point in still.items()
+        ]
+        changes["view"] = View(*curves, values.get("up", (0.0, 1.0, 0.0)))
     return Camera(**(defaults | changes))
-
-
-def _refuse_animation(raw: list[dict[str, Any]], place: Place) -> None:
-    for index, values in enumerate(raw):
-        here = place.item(index)
-        track = read_table(values, ANIMATION, here)
-        times = track["times"]
-        if any(later <= earlier for earlier, later in itertools.pairwise(times)):
-            raise here.key("times").error("expected times that grow")
-        raise here.error("animation is not supported yet")
 
 
 def _direction(value: tuple[float, ...], place: Place) -> np.ndarray:
