@@ -49,6 +49,9 @@ static inline uint regenerate(
 #if AOV_DIRECT
     __global float *direct,
 #endif
+#if BASE
+    __global float *base,
+#endif
 #if CELLS
     __global Beyond *beyond,
 #endif
@@ -72,6 +75,10 @@ static inline uint regenerate(
         const Vec3 shared = get_v(path, PATH_BEYOND_R);
         exponent = max(exponent, exponent_bits(shared));
 #endif
+#if BASE
+        Vec3 base_part = get_v(path, PATH_BASE_R);
+        exponent = max(exponent, exponent_bits(base_part));
+#endif
         const Mask bad = done & (exponent >= MAX_EXPONENT_BITS);
         const Vec3 black = vec3_all((Float)(0.0f));
         radiance = pick_v(bad, black, radiance);
@@ -94,6 +101,13 @@ static inline uint regenerate(
         store_lanes(direct_part.y, lane_direct[1]);
         store_lanes(direct_part.z, lane_direct[2]);
 #endif
+#if BASE
+        base_part = pick_v(bad, black, base_part);
+        float lane_base[3][W];
+        store_lanes(base_part.x, lane_base[0]);
+        store_lanes(base_part.y, lane_base[1]);
+        store_lanes(base_part.z, lane_base[2]);
+#endif
 #if CELLS
         // What is rejected is not shared.
         uint lane_vertex[W];
@@ -109,6 +123,9 @@ static inline uint regenerate(
             vstore4((float4)(lane_value[0][k], lane_value[1][k], lane_value[2][k], 1.0f), at, samples);
 #if AOV_DIRECT
             vstore4((float4)(lane_direct[0][k], lane_direct[1][k], lane_direct[2][k], 1.0f), at, direct);
+#endif
+#if BASE
+            vstore4((float4)(lane_base[0][k], lane_base[1][k], lane_base[2][k], 1.0f), at, base);
 #endif
 #if CELLS
             vstore4((float4)(lane_shared[0][k], lane_shared[1][k], lane_shared[2][k], as_float(lane_vertex[k])),
@@ -200,6 +217,9 @@ static inline uint regenerate(
 #if AOV_DIRECT
         put_v(path, PATH_DIRECT_R, pick_v(start, zero, get_v(path, PATH_DIRECT_R)));
 #endif
+#if BASE
+        put_v(path, PATH_BASE_R, pick_v(start, zero, get_v(path, PATH_BASE_R)));
+#endif
         put_u(path, PATH_SEED, pick_u(start, seed, get_u(path, PATH_SEED)));
         status = pick_u(start, (UInt)(STATUS_ALIVE), status);
     }
@@ -215,7 +235,7 @@ static inline uint regenerate(
 /// A sample that is not finite, or too large to be summed, is handed in as black and counted.
 ///
 /// reads   pool, counters
-/// writes  pool; samples (direct, beyond) of finished paths; counters.{next_pixel, finished[],
+/// writes  pool; samples (direct, base, beyond) of finished paths; counters.{next_pixel, finished[],
 ///         rejected_samples, pending_camera}
 kernel void regenerate_paths(
     __global const Params *params,
@@ -223,6 +243,9 @@ kernel void regenerate_paths(
     volatile __global uint *counters,
 #if AOV_DIRECT
     __global float *direct,
+#endif
+#if BASE
+    __global float *base,
 #endif
 #if CELLS
     __global Beyond *beyond,
@@ -243,6 +266,9 @@ kernel void regenerate_paths(
         claimed = regenerate(params, pool_at(pool, item), claimed, &tally, counters,
 #if AOV_DIRECT
                              direct,
+#endif
+#if BASE
+                             base,
 #endif
 #if CELLS
                              beyond,

@@ -137,11 +137,23 @@ kernel void store_cells(
     }
 }
 
+#if BASE
+/// Part of the light from beyond a sample's vertex that the base of the first surface reflects.
+static inline float4 base_share_of(__global const Beyond *beyond, __global const Seen *seen, ulong sample)
+{
+#if BASE == 2
+    if ((beyond[sample].vertex & VERTEX_MASK) > 1u)
+        return vload4(0, seen[sample].share);
+#endif
+    return (float4)(1.0f);
+}
+#endif
+
 /// Add the light from behind the vertices to the samples of every complete pass: the average of the cell,
 /// or the sample's own where there is none.  One work item W pixels, after store_cells.
 ///
-/// reads   beyond, vertices, cell_keys, cells, full_buckets
-/// writes  samples; counters.unfiltered_samples (atomic)
+/// reads   beyond, vertices, cell_keys, cells, full_buckets, seen
+/// writes  samples, base; counters.unfiltered_samples (atomic)
 kernel void look_up_cells(
     __global const Params *params,
     __global const Beyond *beyond,
@@ -150,6 +162,10 @@ kernel void look_up_cells(
     __global const uint *cell_keys,
     __global const Cell *cells,
     __global const uint *full_buckets,
+#if BASE
+    __global const Seen *seen,
+    __global float *base,
+#endif
     __global float *samples)
 {
     const uint first = get_global_id(0) * W;
@@ -198,11 +214,14 @@ kernel void look_up_cells(
         store_lanes(light.x, lane_light[0]);
         store_lanes(light.y, lane_light[1]);
         store_lanes(light.z, lane_light[2]);
-        const ulong base = (ulong)table * params->pixel_count + first;
+        const ulong at_first = (ulong)table * params->pixel_count + first;
         for (uint left = lane_bits(wanted); left; left &= left - 1u) {
             const uint i = lowest_bit(left);
             const float4 more = (float4)(lane_light[0][i], lane_light[1][i], lane_light[2][i], 0.0f);
-            vstore4(vload4(base + i, samples) + more, base + i, samples);
+            vstore4(vload4(at_first + i, samples) + more, at_first + i, samples);
+#if BASE
+            vstore4(vload4(at_first + i, base) + more * base_share_of(beyond, seen, at_first + i), at_first + i, base);
+#endif
         }
     }
 }

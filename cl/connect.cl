@@ -20,7 +20,7 @@ static inline uint connect_paths(__global const Params *params, __global Float *
                                       GEOMETRY_ARGUMENTS);
     const Vec3 zero = vec3_all((Float)(0.0f));
     const Vec3 arrives = pick_v(wanted & !blocked, light, zero);
-#if AOV_DIRECT || CELLS
+#if AOV_DIRECT || BASE || CELLS
     // The vertex that sent the ray: the path has moved on unless it ended.
     const UInt status = get_u(path, PATH_STATUS);
     const UInt depth = (status & DEPTH_MASK)
@@ -33,9 +33,18 @@ static inline uint connect_paths(__global const Params *params, __global Float *
 #else
     const Vec3 share = vec3_all((Float)(1.0f));
 #endif
-    gather_light(path, shares_connection(params, vertex, depth), share, arrives);
+    const Mask shared = shares_connection(params, vertex, depth);
+    const Vec3 rest = gather_light(path, shared, share, arrives);
+    const Mask reflected = !((vertex == 1u) & shared);
 #else
     put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), arrives));
+    const Vec3 rest = arrives;
+    const Mask reflected = MASK_ALL;
+#endif
+#if BASE == 2
+    keep_base(path, reflected, get_v(path, PATH_BASE_LIGHT_R), rest);
+#elif BASE
+    keep_base(path, reflected, vec3_all((Float)(1.0f)), rest);
 #endif
 #if AOV_DIRECT
     put_v(path, PATH_DIRECT_R, add(get_v(path, PATH_DIRECT_R), pick_v(depth == 0u, arrives, zero)));
@@ -48,8 +57,8 @@ static inline uint connect_paths(__global const Params *params, __global Float *
 ///
 /// Also paths that have ended may have a last one.
 ///
-/// reads   pool.{shadow, toward, light, status, vertex}; geometry
-/// writes  pool.radiance (direct, beyond), pool.light (cleared); counters.pending_shadow
+/// reads   pool.{shadow, toward, light, status, vertex, base_light}; geometry
+/// writes  pool.radiance (direct, base, beyond), pool.light (cleared); counters.pending_shadow
 kernel void connect_lights(
     __global const Params *params,
     __global float *pool,

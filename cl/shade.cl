@@ -25,6 +25,66 @@ static inline Float emission_weight(__global const Params *params, Mask camera_r
     return pick(camera_ray, (Float)(1.0f), weight);
 }
 
+#if SEEN
+/// Hand in the first surface; nothing where `hit` is not set.
+LARGE_FUNCTION void store_seen(
+    __global const Params *params,
+    __global Seen *seen,
+    Mask mask,
+    Mask hit,
+    UInt sample,
+    UInt pixel,
+    Vec3 p,
+    Vec3 ns,
+    Vec3 gate)
+{
+    const Vec3 zero = vec3_all((Float)(0.0f));
+    const Vec3 place = pick_v(hit, p, zero);
+    const Vec3 factor = pick_v(hit, gate, zero);
+    const Float values[9] = {place.x, place.y, place.z, ns.x, ns.y, ns.z, factor.x, factor.y, factor.z};
+    float lane_value[9][W];
+    uint lane_hit[W];
+    uint lane_sample[W];
+    uint lane_pixel[W];
+    for (uint c = 0; c < 9; ++c)
+        store_lanes(values[c], lane_value[c]);
+    store_lanes_u(pick_u(hit, (UInt)(1u), (UInt)(0u)), lane_hit);
+    store_lanes_u(sample & (params->ring - 1u), lane_sample);
+    store_lanes_u(pixel, lane_pixel);
+    for (uint left = lane_bits(mask); left; left &= left - 1u) {
+        const uint k = lowest_bit(left);
+        const ulong at = (ulong)lane_sample[k] * params->pixel_count + lane_pixel[k];
+        __global float *words = (__global float *)(seen + at);
+        vstore8((float8)(lane_value[0][k], lane_value[1][k], lane_value[2][k], as_float(lane_hit[k]),
+                         lane_value[3][k], lane_value[4][k], lane_value[5][k], 0.0f),
+                0, words);
+        vstore4((float4)(lane_value[6][k], lane_value[7][k], lane_value[8][k], 0.0f), 2, words);
+    }
+}
+#endif
+
+#if CELLS && BASE == 2
+/// Hand in what part of all that comes from beyond the first surface its base reflects.
+static inline void store_base_share(
+    __global const Params *params, __global Seen *seen, Mask mask, UInt sample, UInt pixel, Vec3 share)
+{
+    float lane_share[3][W];
+    uint lane_sample[W];
+    uint lane_pixel[W];
+    store_lanes(share.x, lane_share[0]);
+    store_lanes(share.y, lane_share[1]);
+    store_lanes(share.z, lane_share[2]);
+    store_lanes_u(sample & (params->ring - 1u), lane_sample);
+    store_lanes_u(pixel, lane_pixel);
+    for (uint left = lane_bits(mask); left; left &= left - 1u) {
+        const uint k = lowest_bit(left);
+        const ulong at = (ulong)lane_sample[k] * params->pixel_count + lane_pixel[k];
+        vstore4((float4)(lane_share[0][k], lane_share[1][k], lane_share[2][k], 0.0f), 3,
+                (__global float *)(seen + at));
+    }
+}
+#endif
+
 #if AOV_FEATURES
 /// Hand in what the first surface looks like: albedo, normal, depth (planes of weighted values).
 static inline void store_features(
@@ -71,8 +131,9 @@ static inline void store_features(
 /// Shade what the rays hit, prepare a shadow ray, and send the paths on or end them.
 ///
 /// reads   pool, scene tables
-/// writes  pool.{status, origin, direction, beta, radiance, direct, pdf, shadow, toward, light}; features;
-///         with LIGHT_SAMPLING pool.light_normal; with CELLS pool.{vertex, length, beyond, share, light_share}, vertices
+/// writes  pool.{status, origin, direction, beta, radiance, direct, base, base_share, base_light, pdf, shadow,
+///         toward, light}; features; seen; with LIGHT_SAMPLING pool.light_normal;
+///         with CELLS pool.{vertex, length, beyond, share, light_share}, vertices
 kernel void shade_paths(
     __global const Params *params,
     __global const Surface *surfaces,
@@ -91,6 +152,9 @@ kernel void shade_paths(
 #endif
 #if AOV_FEATURES
     __global float *features,
+#endif
+#if SEEN
+    __global Seen *seen,
 #endif
 #if CELLS
     __global CellVertex *vertices,
@@ -191,12 +255,23 @@ kernel void shade_paths(
     put_u(path, PATH_VERTEX, known | near_bit(params, hit, vertex, depth, length, FIELD(path, PATH_HIT_T)));
 #if CELLS == 2
     Vec3 share = get_v(path, PATH_SHARE_R);
-    gather_light(path, shares_emission(params, vertex, depth), share, brought);
+    const Vec3 rest = gather_light(path, shares_emission(params, vertex, depth), share, brought);
 #else
-    gather_light(path, shares_emission(params, vertex, depth), vec3_all((Float)(1.0f)), brought);
+    const Vec3 rest =
+        gather_light(path, shares_emission(params, vertex, depth), vec3_all((Float)(1.0f)), brought);
 #endif
+    // What the first surface did not share is none of its base's.
+    const Mask reflected = !camera_ray & !((vertex == 1u) & shares_emission(params, vertex, depth));
 #else
     put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), brought));
+    const Vec3 rest = brought;
+    const Mask reflected = !camera_ray;
+#endif
+#if BASE == 2
+    Vec3 base_part = get_v(path, PATH_BASE_SHARE_R);
+    keep_base(path, reflected, base_part, rest);
+#elif BASE
+    keep_base(path, reflected, vec3_all((Float)(1.0f)), rest);
 #endif
 #if AOV_DIRECT
     put_v(path, PATH_DIRECT_R, add(get_v(path, PATH_DIRECT_R), pick_v(depth <= 1u, brought, zero)));
@@ -223,6 +298,16 @@ kernel void shade_paths(
 #endif
 
     const Mask goes_on = hit & (depth < params->max_depth);
+#if SEEN
+#if BASE
+    // The others wait for the reflectance of their base.
+    const Mask sees = alive & camera_ray & !goes_on;
+#else
+    const Mask sees = alive & camera_ray;
+#endif
+    if (any_lane(sees))
+        store_seen(params, seen, sees, hit, sample, pixel, s.p, s.ns, zero);
+#endif
     if (!any_lane(goes_on)) {
         put_u(path, PATH_STATUS, pick_u(alive, STATUS_DONE | depth, status));
         return;
@@ -236,14 +321,21 @@ kernel void shade_paths(
     const Vec3 wo_local = vec3(dot3(tangent, wo), dot3(bitangent, wo), max(dot3(s.ns, wo), (Float)(1e-6f)));
     const LobeChances chances = lobe_chances(b, wo_local.z);
 
-#if CELLS
+#if CELLS || BASE
     // Light is divided by the reflectance of the base before it is shared: textures stay sharp.
-#if CELLS == 2
+#if CELLS == 2 || BASE == 2
     const Float base = base_gate(chances);
     const Vec3 gate = mul(beta, scale(b.base_color, base));
 #else
     const Vec3 gate = mul(beta, b.base_color);
 #endif
+#endif
+#if BASE
+    const Mask reflects = goes_on & camera_ray;
+    if (any_lane(reflects))
+        store_seen(params, seen, reflects, reflects, sample, pixel, s.p, s.ns, gate);
+#endif
+#if CELLS
     const Mask chosen = goes_on & (vertex == 0u) & (max3(gate) > 0.0f)
                         & wants_cell(params, depth, length, FIELD(path, PATH_HIT_T), pdf_bsdf);
     if (any_lane(chosen)) {
@@ -296,6 +388,9 @@ kernel void shade_paths(
 #if CELLS == 2
         put_v(path, PATH_LIGHT_SHARE_R, pick_v(chosen, base_share(b, chances, base, wi_local, f), share));
 #endif
+#if BASE == 2
+        put_v(path, PATH_BASE_LIGHT_R, pick_v(camera_ray, base_share(b, chances, base, wi_local, f), base_part));
+#endif
         // On the far side (glass) the ray starts below; the light stays where it is.
         const Vec3 origin = ray_origin(s, light.wi);
         put_v(path, PATH_SHADOW_X, origin);
@@ -314,6 +409,14 @@ kernel void shade_paths(
 #if CELLS == 2
     share = pick_v(chosen, base_share(b, chances, base, drawn, f), share);
     put_v(path, PATH_SHARE_R, share);
+#endif
+#if BASE == 2
+    base_part = pick_v(camera_ray, base_share(b, chances, base, drawn, f), base_part);
+    put_v(path, PATH_BASE_SHARE_R, base_part);
+#if CELLS
+    if (any_lane(reflects))
+        store_base_share(params, seen, reflects, sample, pixel, base_part);
+#endif
 #endif
     beta = mul(beta, scale(f, 1.0f / pick(pdf > 0.0f, pdf, (Float)(1.0f))));
     const Float carried = beta.x + beta.y + beta.z;

@@ -25,7 +25,7 @@ from psf_cl.scene.model import (
     shines,
 )
 from psf_cl.settings import Settings
-from psf_cl.stages import camera, cells, connect, film, intersect, shade
+from psf_cl.stages import camera, cells, connect, film, intersect, screen, seen, shade
 from psf_cl.stages.spec import BufferSpec, Context, Feature, StageSpec
 from psf_cl.tables import distinct_images, few_triangles, flatten, visible_shapes
 from psf_cl.traits import DeviceTraits
@@ -245,7 +245,7 @@ def make_plan(
         else 0,
     )
     stages = []
-    for module in (camera, intersect, shade, connect, cells, film):
+    for module in (camera, intersect, shade, connect, cells, seen, film, screen):
         stage = module.plan(context)
         if stage is not None:
             stages.append(stage)
@@ -309,6 +309,7 @@ def _ring(
     behind them, at least two passes, as far as memory goes.
     """
     planes = 1 + features["AOV_DIRECT"].value + 3 * features["AOV_FEATURES"].value
+    planes += 4 * features["SEEN"].value + bool(features["BASE"].value)
     # With a vertex, what lies behind it, and about one cell: its sums and its key.
     cell_bytes = 16 + 32 + 36 if features["CELLS"].value else 0
     sample_bytes = 16 * planes + cell_bytes
@@ -427,6 +428,12 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "no albedo, normal or depth was asked for",
         ),
         "CELLS": _cells(settings, glossy),
+        "SEEN": switch(
+            settings.screen_filter != "off",
+            "screen_filter compares what pixels see",
+            "screen_filter is off",
+        ),
+        "BASE": _base(settings, glossy),
     }
 
 
@@ -449,12 +456,21 @@ def _cells(settings: Settings, glossy: bool) -> Feature:
     return Feature(1, "path_filter is hash_grid; every material is matt")
 
 
+def _base(settings: Settings, glossy: bool) -> Feature:
+    """Return whether what first surfaces reflect is kept apart, and if so how much of it."""
+    if settings.screen_filter == "off":
+        return Feature(0, "screen_filter is off")
+    if glossy:
+        return Feature(2, "screen_filter averages the light of diffuse bases")
+    return Feature(1, "screen_filter averages all light that is reflected; every material is matt")
+
+
 def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     """Return the features with those that are off turned on.
 
     What is on keeps its value: as an image of one texel a constant sky would be sampled otherwise.
     """
-    most = {"ALPHA": 2, "ENVIRONMENT": 2, "CELLS": 2}
+    most = {"ALPHA": 2, "ENVIRONMENT": 2, "CELLS": 2, "BASE": 2}
     full = {
         name: feature
         if feature.value

@@ -33,7 +33,7 @@ from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Scene
 from psf_cl.scheduler import Hooks, Progress, Scheduler, doubling_epoch
 from psf_cl.settings import Settings, resolve
-from psf_cl.stages import cells, film
+from psf_cl.stages import cells, film, screen
 
 #: Looks of the host at the counters for each count of the paths by depth, which takes 0.4 ms on two
 #: CPU cores; the first look, which is left out, is at a pool that is still empty.
@@ -168,6 +168,8 @@ class Renderer:
             launch(self._film_items(planes), film.GROUP)
         if self.half is not None:
             self.half(self._film_items(1), film.GROUP)
+        if self.add_seen is not None:
+            self.add_seen(self._film_items(1), film.GROUP)
         if self.clear_cells is not None:
             self.clear_cells(cells.buckets(self.plan.pixel_count))
         self.advance(1)
@@ -228,7 +230,7 @@ class Renderer:
             counters[layout.COUNTER_INDEX[name]] = first
         self.device.write(self.buffers["counters"], counters)
         names = (name for ring, sums, _ in film.PLANES for name in (ring, sums))
-        for name in ("pool", "film_half", *names):
+        for name in ("pool", "film_half", "surfaces_seen", *names):
             if name in self.buffers:
                 self.device.fill(self.buffers[name])
 
@@ -364,6 +366,8 @@ class Renderer:
         if "film_direct" in sums:
             aovs["direct"] = mean(sums["film_direct"][0])
             aovs["indirect"] = aovs["rgb"] - aovs["direct"]
+        if self.screen_launches and not partial:
+            aovs["rgb"] = self._filtered()
         if "film_features" in sums:
             aovs["albedo"], aovs["normal"], depth = (mean(plane) for plane in sums["film_features"])
             aovs["depth"] = depth[..., :1]
@@ -385,6 +389,13 @@ class Renderer:
             full_width=self.scene.width,
             full_height=self.scene.height,
         )
+
+    def _filtered(self) -> np.ndarray:
+        for launch, items in self.screen_launches:
+            launch(items, film.GROUP)
+        image = np.zeros((self.plan.pixel_count, 3), np.float32)
+        image[self.order] = self.device.read(self.buffers["filtered"]).reshape(-1, 4)[:, :3]
+        return image.reshape(self.plan.crop[3], self.plan.crop[2], 3)
 
     def save(self, path: str | os.PathLike[str]) -> bool:
         """Write a checkpoint, if this is a moment for one.
@@ -638,6 +649,7 @@ class Renderer:
         # There is no frame before the first: nothing has moved.
         values |= {new: values[name] for new, name in tables.PREVIOUS_CAMERA.items()}
         values |= cells.parameters(scene, settings, self.plan.pixel_count)
+        values |= screen.parameters(settings)
         for name, value in values.items():
             params[0][name] = value
         return params
@@ -702,6 +714,10 @@ class Renderer:
             if "film_half" in self.buffers
             else None
         )
+        self.add_seen = (
+            programs["seen"].bind_planned("add_seen", self.buffers) if "seen" in programs else None
+        )
+        self.screen_launches = self._per_pixel_launches(programs, "screen")
         self.advance = self.film_program.bind_planned("advance_film", self.buffers)
         if self.statistics:
             self.census = self.film_program.bind(
@@ -711,6 +727,21 @@ class Renderer:
                 census=self.buffers["census"],
                 bins=film.CENSUS_BINS,
             )
+
+    def _per_pixel_launches(
+        self, programs: dict[str, Program], name: str
+    ) -> list[tuple[Launch, int]]:
+        """Return the launches of a stage that works on pixels, with their work items."""
+        traits, pixels = self.plan.traits, self.plan.pixel_count
+        return [
+            (
+                programs[name].bind_planned(kernel.name, self.buffers),
+                -(-pixels // kernel.paths_per_item(traits)),
+            )
+            for stage in self.plan.stages
+            if stage.name == name
+            for kernel in stage.kernels
+        ]
 
     def _bind_cells(self, program: Program | None) -> None:
         self.cell_launches: list[Launch] = []

@@ -87,6 +87,15 @@ class Settings:
     cell_shrink: bool = _switch(
         True, doc="make cells smaller from pass to pass: consistent; else the image stays blurred"
     )
+    screen_filter: str = _choice(
+        "off",
+        "path_space",
+        doc="average the picture over neighbouring pixels that see the same surface",
+    )
+    screen_radius: float = _number(
+        12.0, 0.0, 1e4, doc="how far these are, pixels, for one sample; count^(-1/4) of it for more"
+    )
+    screen_neighbours: int = _number(24, 1, 256, doc="how many of them are asked")
     seed: int = _number(0, 0, 0xFFFFFFFF, doc="start of every random sequence")
 
     def __post_init__(self) -> None:

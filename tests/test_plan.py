@@ -247,7 +247,12 @@ def test_every_flag_at_once_renders(wants):
     shape = replace(scene.shapes[0], mesh=colored, material=len(scene.materials))
     scene = replace(scene, shapes=(*scene.shapes, shape), materials=(*scene.materials, layered))
     opened = renderer(
-        wants(flags), scene, AOVS, path_filter="hash_grid", light_sampling="hierarchy"
+        wants(flags),
+        scene,
+        AOVS,
+        path_filter="hash_grid",
+        screen_filter="path_space",
+        light_sampling="hierarchy",
     )
     assert all(feature.value for feature in opened.plan.features.values())
     assert opened.plan.left_out == ()

@@ -52,6 +52,12 @@
 #ifndef AOV_FEATURES
 #error "AOV_FEATURES must be 0 or 1"
 #endif
+#ifndef SEEN
+#error "SEEN must be 0 or 1 (the first surface is kept)"
+#endif
+#ifndef BASE
+#error "BASE must be 0, 1 (what the first surface reflects is kept apart) or 2 (only what its base reflects)"
+#endif
 #ifndef FEW
 #error "FEW must be 0 (a tree), or the most corners of the list of triangles"
 #endif

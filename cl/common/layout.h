@@ -82,28 +82,47 @@
 #else
 #define PATH_END_1 33u
 #endif
-#if CELLS >= 1
-#define PATH_VERTEX (PATH_END_1 + 0u) // uint; 1 + depth of the vertex behind which light is shared, VERTEX_NEAR; 0: none
-#define PATH_LENGTH (PATH_END_1 + 1u) // m, from the camera on
-#define PATH_BEYOND_R (PATH_END_1 + 2u) // of what was gathered, what is shared: it came from beyond that vertex
-#define PATH_BEYOND_G (PATH_END_1 + 3u)
-#define PATH_BEYOND_B (PATH_END_1 + 4u)
-#define PATH_END_2 (PATH_END_1 + 5u)
+#if BASE >= 1
+#define PATH_BASE_R (PATH_END_1 + 0u) // of what goes to the pixel, what the base of the first surface reflected
+#define PATH_BASE_G (PATH_END_1 + 1u)
+#define PATH_BASE_B (PATH_END_1 + 2u)
+#define PATH_END_2 (PATH_END_1 + 3u)
 #else
 #define PATH_END_2 PATH_END_1
 #endif
-#if CELLS >= 2
-#define PATH_SHARE_R (PATH_END_2 + 0u) // part of what comes from beyond the vertex that its diffuse base reflects
-#define PATH_SHARE_G (PATH_END_2 + 1u)
-#define PATH_SHARE_B (PATH_END_2 + 2u)
-#define PATH_LIGHT_SHARE_R (PATH_END_2 + 3u) // the same of the shadow ray
-#define PATH_LIGHT_SHARE_G (PATH_END_2 + 4u)
-#define PATH_LIGHT_SHARE_B (PATH_END_2 + 5u)
+#if BASE >= 2
+#define PATH_BASE_SHARE_R (PATH_END_2 + 0u) // part of what comes from beyond that surface that its base reflects
+#define PATH_BASE_SHARE_G (PATH_END_2 + 1u)
+#define PATH_BASE_SHARE_B (PATH_END_2 + 2u)
+#define PATH_BASE_LIGHT_R (PATH_END_2 + 3u) // the same of the shadow ray
+#define PATH_BASE_LIGHT_G (PATH_END_2 + 4u)
+#define PATH_BASE_LIGHT_B (PATH_END_2 + 5u)
 #define PATH_END_3 (PATH_END_2 + 6u)
 #else
 #define PATH_END_3 PATH_END_2
 #endif
-#define PATH_FIELD_COUNT PATH_END_3
+#if CELLS >= 1
+#define PATH_VERTEX (PATH_END_3 + 0u) // uint; 1 + depth of the vertex behind which light is shared, VERTEX_NEAR; 0: none
+#define PATH_LENGTH (PATH_END_3 + 1u) // m, from the camera on
+#define PATH_BEYOND_R (PATH_END_3 + 2u) // of what was gathered, what is shared: it came from beyond that vertex
+#define PATH_BEYOND_G (PATH_END_3 + 3u)
+#define PATH_BEYOND_B (PATH_END_3 + 4u)
+#define PATH_END_4 (PATH_END_3 + 5u)
+#else
+#define PATH_END_4 PATH_END_3
+#endif
+#if CELLS >= 2
+#define PATH_SHARE_R (PATH_END_4 + 0u) // part of what comes from beyond the vertex that its diffuse base reflects
+#define PATH_SHARE_G (PATH_END_4 + 1u)
+#define PATH_SHARE_B (PATH_END_4 + 2u)
+#define PATH_LIGHT_SHARE_R (PATH_END_4 + 3u) // the same of the shadow ray
+#define PATH_LIGHT_SHARE_G (PATH_END_4 + 4u)
+#define PATH_LIGHT_SHARE_B (PATH_END_4 + 5u)
+#define PATH_END_5 (PATH_END_4 + 6u)
+#else
+#define PATH_END_5 PATH_END_4
+#endif
+#define PATH_FIELD_COUNT PATH_END_5
 
 #define COUNTER_NEXT_PIXEL 0u // next pixel to be started, counted from the first pixel of next_pass
 #define COUNTER_NEXT_PASS 1u // pass that next_pixel 0 belongs to
@@ -170,6 +189,8 @@ typedef struct {
     float cell_limit; // radiance from which a sample is too large for the sums
     uint filter_vertex; // first vertex whose light may be shared; FILTER_AUTO, FILTER_NONE
     uint filter_direct; // whether light that falls on it directly is shared too
+    float screen_radius; // pixels; the screen filter's neighbours of a pixel's first sample
+    uint screen_neighbours; // of a pixel, that the screen filter asks
     uint first_pass; // of this frame; passes are counted on from frame to frame
     float previous_origin[3]; // of the camera of the frame before; world, m
     float previous_right[3]; // unit, world
@@ -356,6 +377,36 @@ typedef struct {
     float squares; // sum of squared deviations from it
     float pad[3]; // fills the record
 } FilmSum;
+
+/// The first surface that a sample sees.
+typedef struct {
+    float p[3]; // world, m
+    uint there; // 0 if nothing is seen
+    float ns[3]; // unit, shading normal
+    float pad0; // fills the word
+    float gate[3]; // throughput there, times the reflectance of the diffuse base
+    float pad1; // fills the word
+    float share[3]; // part of what comes from beyond it that its diffuse base reflects
+    float pad2; // fills the record
+} Seen;
+
+/// The first surface that a pixel sees: means over its samples.
+typedef struct {
+    float p[3]; // world, m
+    uint hits; // samples that see a surface; p and ns are theirs
+    float ns[3]; // of the shading normals
+    uint count; // samples
+    float gate[3]; // of all samples: 0 where one sees nothing
+    float pad; // fills the record
+} SeenMean;
+
+/// Light of a pixel before the screen filter.
+typedef struct {
+    float rgb[3]; // radiance
+    float count; // samples that it is the mean of
+    float base[3]; // of that, what the diffuse base of the first surface reflected
+    float pad; // fills the record
+} PixelLight;
 
 /// The vertex of a sample behind which light is shared.
 typedef struct {

@@ -12,6 +12,14 @@ static inline UInt divide(UInt x, uint d)
     return q + pick_u(x - q * d >= d, (UInt)(1u), (UInt)(0u));
 }
 
+/// Entry of the queue's order of the pixel in a column and a row of the crop.
+static inline UInt pixel_entry(__global const Params *params, UInt column, UInt row)
+{
+    const UInt top = row - row % STRIP_ROWS;
+    const UInt rows = min((UInt)(STRIP_ROWS), params->crop_height - top);
+    return top * params->crop_width + column * rows + row - top;
+}
+
 /// Column and row on the film of entry `i` of the queue's order (tables.pixel_order).
 static inline void pixel_place(__global const Params *params, UInt i, UInt *x, UInt *y)
 {

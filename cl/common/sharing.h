@@ -1,4 +1,5 @@
-// What of a path is shared: the vertex behind which light goes to a cell, and that light.
+// What of a path is shared: the vertex behind which light goes to a cell, and that light; what of it the
+// base of the first surface reflected.
 #pragma once
 
 #include "lanes.h"
@@ -20,12 +21,14 @@ static inline Mask shares_connection(__global const Params *params, UInt vertex,
 }
 
 /// Add radiance to what a path gathered: `share` of the lanes of `shared` to what came from beyond its
-/// vertex.
-static inline void gather_light(__global Float *path, Mask shared, Vec3 share, Vec3 radiance)
+/// vertex.  Returns the rest, which goes straight to the pixel.
+static inline Vec3 gather_light(__global Float *path, Mask shared, Vec3 share, Vec3 radiance)
 {
     const Vec3 part = pick_v(shared, mul(share, radiance), vec3_all((Float)(0.0f)));
-    put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), sub(radiance, part)));
+    const Vec3 rest = sub(radiance, part);
+    put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), rest));
     put_v(path, PATH_BEYOND_R, add(get_v(path, PATH_BEYOND_R), part));
+    return rest;
 }
 
 /// Whether this vertex is the one whose light is shared.
@@ -80,5 +83,15 @@ static inline void store_cell_vertices(
                          lane_value[3][k], lane_value[4][k], lane_value[5][k], lane_value[6][k]),
                 at, (__global float *)vertices);
     }
+}
+#endif
+
+#if BASE
+/// Keep apart what the base of the first surface reflected of radiance that goes straight to the pixel:
+/// `share` of the lanes of `reflected`.
+static inline void keep_base(__global Float *path, Mask reflected, Vec3 share, Vec3 radiance)
+{
+    const Vec3 part = pick_v(reflected, mul(share, radiance), vec3_all((Float)(0.0f)));
+    put_v(path, PATH_BASE_R, add(get_v(path, PATH_BASE_R), part));
 }
 #endif

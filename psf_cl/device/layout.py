@@ -99,6 +99,8 @@ PARAMS = Record(
     float cell_limit - radiance from which a sample is too large for the sums
     uint filter_vertex - first vertex whose light may be shared; FILTER_AUTO, FILTER_NONE
     uint filter_direct - whether light that falls on it directly is shared too
+    float screen_radius - pixels; the screen filter's neighbours of a pixel's first sample
+    uint screen_neighbours - of a pixel, that the screen filter asks
     uint first_pass - of this frame; passes are counted on from frame to frame
     float previous_origin[3] - of the camera of the frame before; world, m
     float previous_right[3] - unit, world
@@ -332,6 +334,45 @@ FILM_SUM = Record(
     """),
 )
 
+SEEN = Record(
+    "Seen",
+    "The first surface that a sample sees.",
+    _fields("""
+    float p[3] - world, m
+    uint there - 0 if nothing is seen
+    float ns[3] - unit, shading normal
+    float pad0 - fills the word
+    float gate[3] - throughput there, times the reflectance of the diffuse base
+    float pad1 - fills the word
+    float share[3] - part of what comes from beyond it that its diffuse base reflects
+    float pad2 - fills the record
+    """),
+)
+
+SEEN_MEAN = Record(
+    "SeenMean",
+    "The first surface that a pixel sees: means over its samples.",
+    _fields("""
+    float p[3] - world, m
+    uint hits - samples that see a surface; p and ns are theirs
+    float ns[3] - of the shading normals
+    uint count - samples
+    float gate[3] - of all samples: 0 where one sees nothing
+    float pad - fills the record
+    """),
+)
+
+PIXEL_LIGHT = Record(
+    "PixelLight",
+    "Light of a pixel before the screen filter.",
+    _fields("""
+    float rgb[3] - radiance
+    float count - samples that it is the mean of
+    float base[3] - of that, what the diffuse base of the first surface reflected
+    float pad - fills the record
+    """),
+)
+
 CELL_VERTEX = Record(
     "CellVertex",
     "The vertex of a sample behind which light is shared.",
@@ -380,6 +421,9 @@ RECORDS = (
     LIGHT_BOUNDS,
     ENVIRONMENT_CELL,
     FILM_SUM,
+    SEEN,
+    SEEN_MEAN,
+    PIXEL_LIGHT,
     CELL_VERTEX,
     BEYOND,
     CELL,
@@ -428,6 +472,27 @@ OPTIONAL_PATH_FIELDS = (
         "LIGHT_SAMPLING",
         1,
         (("light_normal", "uint; packed: what the last light was chosen for, besides the origin"),),
+    ),
+    (
+        "BASE",
+        1,
+        (
+            ("base_r", "of what goes to the pixel, what the base of the first surface reflected"),
+            ("base_g", ""),
+            ("base_b", ""),
+        ),
+    ),
+    (
+        "BASE",
+        2,
+        (
+            ("base_share_r", "part of what comes from beyond that surface that its base reflects"),
+            ("base_share_g", ""),
+            ("base_share_b", ""),
+            ("base_light_r", "the same of the shadow ray"),
+            ("base_light_g", ""),
+            ("base_light_b", ""),
+        ),
     ),
     (
         "CELLS",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from psf_cl.device import layout
-from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
+from psf_cl.stages.spec import POOL_FLAGS, BufferSpec, Context, KernelSpec, StageSpec
 
 
 def plan(context: Context) -> StageSpec:
@@ -28,22 +28,27 @@ def plan(context: Context) -> StageSpec:
     if context.on("AOV_DIRECT"):
         direct = ("direct",)
         buffers.append(BufferSpec("direct", float32, samples, "direct light of the same", True))
+    base: tuple[str, ...] = ()
+    if context.on("BASE"):
+        base = ("base",)
+        what = "what first surfaces reflect of the same"
+        buffers.append(BufferSpec("base", float32, samples, what, True))
     shared = ("beyond", "vertex") if context.on("CELLS") else ()
-    started = ("origin", "direction", "beta", "radiance", *direct, "seed", "status")
+    started = ("origin", "direction", "beta", "radiance", *direct, *base, "seed", "status")
     named = ("sample", "pixel")
     kernel = KernelSpec(
         "regenerate_paths",
         reads=(*started, *named, *shared),
         writes=(*started, *named),
         # A weighted sample a plane.
-        record_bytes=16 * (1 + len(direct) + context.on("CELLS")),
+        record_bytes=16 * (1 + len(direct) + len(base) + context.on("CELLS")),
         runs=True,
     )
     return StageSpec(
         "camera",
         "paths start at the camera",
         "camera.cl",
-        flags=("LENS", "AOV_DIRECT", "CELLS", "LIGHT_SAMPLING"),
+        flags=("LENS", "AOV_DIRECT", *POOL_FLAGS),
         kernels=(kernel,),
         buffers=tuple(buffers),
     )

@@ -131,7 +131,7 @@ def plan(context: Context) -> StageSpec | None:
         "cells",
         "light is shared by the paths that meet in a cell",
         "cells.cl",
-        flags=("CELLS",),
+        flags=("BASE", "CELLS"),
         kernels=kernels,
         buffers=buffers,
         per_pass=True,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from psf_cl.stages.spec import Context, KernelSpec, StageSpec
+from psf_cl.stages.spec import POOL_FLAGS, Context, KernelSpec, StageSpec
 
 
 def plan(context: Context) -> StageSpec | None:
@@ -14,13 +14,17 @@ def plan(context: Context) -> StageSpec | None:
     moved = ("vertex", "status") if context.on("CELLS") else ()
     if context.features["CELLS"].value == 2:
         moved = (*moved, "light_share")
+    base: tuple[str, ...] = ("base",) if context.on("BASE") else ()
+    kept = (*base, "status") if base else ()
+    if context.features["BASE"].value == 2:
+        kept = (*kept, "base_light")
     # What blends by chance has random numbers of its path.
     numbers = ("seed", "sample", "status") if context.features["ALPHA"].value == 2 else ()
-    reads = ("light", "shadow", "toward", "radiance", *direct, *shared, *moved, *numbers)
+    reads = ("light", "shadow", "toward", "radiance", *direct, *kept, *shared, *moved, *numbers)
     kernel = KernelSpec(
         "connect_lights",
         reads=tuple(dict.fromkeys(reads)),
-        writes=("light", "radiance", *direct[:1], *shared),
+        writes=("light", "radiance", *direct[:1], *base, *shared),
         rays=("shadow",),
         runs=True,
     )
@@ -28,7 +32,7 @@ def plan(context: Context) -> StageSpec | None:
         "connect",
         "sampled lights need to be seen",
         "connect.cl",
-        flags=("FEW", "ALPHA", "VERTEX_COLORS", "AOV_DIRECT", "CELLS", "LIGHT_SAMPLING"),
+        flags=("FEW", "ALPHA", "VERTEX_COLORS", "AOV_DIRECT", *POOL_FLAGS),
         kernels=(kernel,),
         traces=True,
     )

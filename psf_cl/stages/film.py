@@ -5,10 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from psf_cl.device import layout
-from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
+from psf_cl.stages.spec import POOL_FLAGS, BufferSpec, Context, KernelSpec, StageSpec
 
 #: Ring buffer of samples, the film's buffer that it is added to, and planes in it.
-PLANES = (("samples", "film", 1), ("direct", "film_direct", 1), ("features", "film_features", 3))
+PLANES = (
+    ("samples", "film", 1),
+    ("direct", "film_direct", 1),
+    ("base", "film_base", 1),
+    ("features", "film_features", 3),
+)
 
 #: Depths that the occupancy statistics tell apart; the last takes all beyond.
 CENSUS_BINS = 32
@@ -25,12 +30,15 @@ def plan(context: Context) -> StageSpec:
         buffers.append(
             BufferSpec("film_direct", dtype, context.pixel_count, "sums of the direct light")
         )
+    if context.on("BASE"):
+        what = "sums of what first surfaces reflect"
+        buffers.append(BufferSpec("film_base", dtype, context.pixel_count, what))
     if context.on("AOV_FEATURES"):
         count = 3 * context.pixel_count
         buffers.append(
             BufferSpec("film_features", dtype, count, "sums of albedo, normal and depth")
         )
-    planes = 1 + context.on("AOV_DIRECT") + 3 * context.on("AOV_FEATURES")
+    planes = 1 + context.on("AOV_DIRECT") + context.on("BASE") + 3 * context.on("AOV_FEATURES")
     # A weighted value; the sums are read and written.
     sample_bytes = planes * (16 + 2 * dtype.itemsize)
     kernels = [
@@ -51,7 +59,7 @@ def plan(context: Context) -> StageSpec:
         "film",
         "samples are summed pass by pass",
         "film.cl",
-        flags=("CELLS", "LIGHT_SAMPLING"),
+        flags=POOL_FLAGS,
         kernels=tuple(kernels),
         buffers=tuple(buffers),
         per_pass=True,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from psf_cl.stages.spec import Context, KernelSpec, StageSpec
+from psf_cl.stages.spec import POOL_FLAGS, Context, KernelSpec, StageSpec
 
 
 def plan(context: Context) -> StageSpec:
@@ -20,7 +20,7 @@ def plan(context: Context) -> StageSpec:
         "intersect",
         "every ray needs its closest hit",
         "intersect.cl",
-        flags=("FEW", "ALPHA", "VERTEX_COLORS", "CELLS", "LIGHT_SAMPLING"),
+        flags=("FEW", "ALPHA", "VERTEX_COLORS", *POOL_FLAGS),
         kernels=(kernel,),
         traces=True,
     )

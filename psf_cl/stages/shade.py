@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from psf_cl.device import layout
-from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
+from psf_cl.stages.spec import POOL_FLAGS, BufferSpec, Context, KernelSpec, StageSpec
 
 
 def plan(context: Context) -> StageSpec:
@@ -39,10 +39,10 @@ def plan(context: Context) -> StageSpec:
             "ENVIRONMENT",
             "ALPHA",
             "CONNECT",
-            "LIGHT_SAMPLING",
             "AOV_DIRECT",
             "AOV_FEATURES",
-            "CELLS",
+            "SEEN",
+            *POOL_FLAGS,
         ),
         kernels=(_kernel(context),),
         buffers=tuple(buffers),
@@ -55,11 +55,16 @@ def _kernel(context: Context) -> KernelSpec:
     cells = context.features["CELLS"].value
     shared = ("vertex", "length", "beyond") if cells else ()
     shared += ("share",) if cells == 2 else ()
+    base: tuple[str, ...] = ("base",) if context.on("BASE") else ()
+    if context.features["BASE"].value == 2:
+        base += ("base_share",)
     shadow = ("shadow", "toward", "light") if context.on("CONNECT") else ()
     if cells == 2 and shadow:
         shadow += ("light_share",)
+    if context.features["BASE"].value == 2 and shadow:
+        shadow += ("base_light",)
     chosen = ("light_normal",) if context.on("LIGHT_SAMPLING") else ()
-    walk = ("status", "direction", "beta", "radiance", "pdf", *direct, *shared, *chosen)
+    walk = ("status", "direction", "beta", "radiance", "pdf", *direct, *base, *shared, *chosen)
     records = [layout.SURFACE, layout.MATERIAL]
     if context.on("SMOOTH"):
         records.append(layout.NORMALS)
@@ -77,6 +82,8 @@ def _kernel(context: Context) -> KernelSpec:
         records.append(layout.ENVIRONMENT_CELL)
     if context.on("CELLS"):
         records.append(layout.CELL_VERTEX)
+    if context.on("SEEN"):
+        records.append(layout.SEEN)
     feature_bytes = 3 * 16 if context.on("AOV_FEATURES") else 0
     return KernelSpec(
         "shade_paths",

@@ -7,9 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from psf_cl.device.layout import path_field_count, path_fields
+from psf_cl.device.layout import OPTIONAL_PATH_FIELDS, path_field_count, path_fields
 from psf_cl.measure.timing import Declared
 from psf_cl.traits import DeviceTraits
+
+#: Features that decide what a path's state is: flags of every stage that works on the pool.
+POOL_FLAGS = tuple(dict.fromkeys(feature for feature, _, _ in OPTIONAL_PATH_FIELDS))
 
 
 @dataclass(frozen=True)
