@@ -198,7 +198,7 @@ typedef struct {
     float previous_forward[3]; // unit, world
     float previous_scale_x; // tangent of half the horizontal field of view
     float previous_scale_y; // tangent of half the vertical field of view
-    uint pad[1]; // fills the record
+    uint pad[3]; // fills the record
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.

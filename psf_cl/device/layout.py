@@ -6,6 +6,7 @@ multiple of 16 bytes.  ``tools/make_layout.py`` writes the header; a test asks t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -55,10 +56,17 @@ def _fields(text: str) -> tuple[Field, ...]:
     return tuple(fields)
 
 
+def _filled(text: str) -> tuple[Field, ...]:
+    """Parse as ``_fields``, and fill the record up to a multiple of 16 bytes."""
+    fields = _fields(text)
+    missing = -sum(math.prod(item.shape) for item in fields) % 4
+    return fields + ((Field("pad", "uint", (missing,), "fills the record"),) if missing else ())
+
+
 PARAMS = Record(
     "Params",
     "Everything that is the same for all paths of a render.",
-    _fields("""
+    _filled("""
     float camera_origin[3] - world, m
     float lens_radius - m
     float camera_right[3] - unit, world
@@ -108,7 +116,6 @@ PARAMS = Record(
     float previous_forward[3] - unit, world
     float previous_scale_x - tangent of half the horizontal field of view
     float previous_scale_y - tangent of half the vertical field of view
-    uint pad[1] - fills the record
     """),
 )
 

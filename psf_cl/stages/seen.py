@@ -21,9 +21,7 @@ def plan(context: Context) -> StageSpec | None:
             KernelSpec("add_seen", record_bytes=one.itemsize + 2 * mean.itemsize, per_sample=True),
         ),
         buffers=(
-            BufferSpec(
-                "seen", one, samples, f"first surfaces of {context.ring} passes in flight", True
-            ),
+            BufferSpec("seen", one, samples, what, True),
             BufferSpec("surfaces_seen", mean, context.pixel_count, "first surfaces of the pixels"),
         ),
         per_pass=True,
