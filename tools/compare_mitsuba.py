@@ -24,6 +24,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -157,9 +158,11 @@ def comparable(scene: Scene, plain: bool) -> Scene:
     return scene
 
 
-def render_mitsuba(scene: Scene, settings: Settings, spp: int, seeds: int) -> Estimate:
-    """Render with Mitsuba's path tracer, with independent samples."""
-    built = mitsuba_scene(scene, settings.max_depth, settings.roulette_depth)
+def render_mitsuba(
+    scene: Scene, settings: Settings, spp: int, seeds: int, bsdf: dict[str, Any] | None = None
+) -> Estimate:
+    """Render with Mitsuba's path tracer, with independent samples; ``bsdf`` as in mitsuba_scene."""
+    built = mitsuba_scene(scene, settings.max_depth, settings.roulette_depth, bsdf=bsdf)
     part = min(spp, max(1, MITSUBA_SAMPLES // (scene.width * scene.height)))
     counts = [min(part, spp - first) for first in range(0, spp, part)]
     images = []

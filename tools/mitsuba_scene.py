@@ -16,9 +16,18 @@ import mitsuba as mi
 import numpy as np
 
 from psf_cl import tables
-from psf_cl.errors import InputError
 from psf_cl.scene import transform
-from psf_cl.scene.model import Light, Material, Scene, Shape, Texture, emits, is_cut_out, shines
+from psf_cl.scene.model import (
+    Environment,
+    Light,
+    Material,
+    Scene,
+    Shape,
+    Texture,
+    emits,
+    is_cut_out,
+    shines,
+)
 
 # Texels of a cut-out's mask along one of the texture: Mitsuba would blend what is cut off here.
 MASK_OVERSAMPLING = 4
@@ -76,7 +85,11 @@ def differences(scene: Scene, own_materials: bool = False) -> list[str]:
 
 
 def mitsuba_scene(
-    scene: Scene, max_depth: int, roulette_depth: int, own_materials: bool = False
+    scene: Scene,
+    max_depth: int,
+    roulette_depth: int,
+    own_materials: bool = False,
+    bsdf: dict[str, Any] | None = None,
 ) -> Any:
     """Return the scene in Mitsuba, its integrator the path tracer.
 
@@ -85,12 +98,8 @@ def mitsuba_scene(
         roulette_depth: bounces before roulette, as psf_cl counts: Mitsuba's ``rr_depth`` less 1.
         own_materials: whether Mitsuba's own plugins are to come close to materials other than
             Lambertian, instead of psf_cl's BSDF written for Mitsuba.
-
-    Raises:
-        InputError: the scene has an environment image.
+        bsdf: a plugin for all surfaces, in place of their materials.
     """
-    if scene.environment.image is not None:
-        raise InputError(f"{scene.path}: expected an environment of constant radiance")
     content: dict[str, Any] = {
         "type": "scene",
         "integrator": {
@@ -106,11 +115,13 @@ def mitsuba_scene(
         groups[shape.material, shape.mesh.normals is not None].append(shape)
     for index, ((material, _), shapes) in enumerate(groups.items()):
         content[f"mesh_{index}"] = _mesh(
-            shapes, scene.materials[material], scene.textures, own_materials
+            shapes, scene.materials[material], scene.textures, own_materials, bsdf
         )
     for index, light in enumerate(filter(shines, scene.lights)):
         content[f"light_{index}"] = _light(light)
-    if max(scene.environment.radiance) > 0.0:
+    if scene.environment.image is not None:
+        content["sky"] = _image_sky(scene.environment)
+    elif max(scene.environment.radiance) > 0.0:
         content["sky"] = {"type": "constant", "radiance": _rgb(scene.environment.radiance)}
     return mi.load_dict(content)
 
@@ -164,6 +175,18 @@ def _light(light: Light) -> dict[str, Any]:
         "intensity": _rgb(light.intensity),
         "cutoff_angle": math.degrees(light.outer_angle),
         "beam_width": math.degrees(light.inner_angle),
+    }
+
+
+def _image_sky(environment: Environment) -> dict[str, Any]:
+    """Return the sky; both renderers have -Z in the middle of its first column."""
+    placed = np.eye(4)
+    placed[:3, :3] = environment.rotation
+    radiance = environment.image * np.asarray(environment.radiance, np.float32)
+    return {
+        "type": "envmap",
+        "bitmap": mi.Bitmap(np.ascontiguousarray(radiance, np.float32)),
+        "to_world": mi.ScalarTransform4f(placed),
     }
 
 
@@ -269,11 +292,15 @@ def _enlarged(values: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _mesh(
-    shapes: list[Shape], material: Material, textures: tuple[Texture, ...], own_materials: bool
+    shapes: list[Shape],
+    material: Material,
+    textures: tuple[Texture, ...],
+    own_materials: bool,
+    bsdf: dict[str, Any] | None,
 ) -> Any:
     """Return shapes of one material as one mesh, all with shading normals or all without."""
     properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(_bsdf(material, textures, own_materials))
+    properties["bsdf"] = mi.load_dict(bsdf or _bsdf(material, textures, own_materials))
     if emits(material):
         radiance = _colour(material.emission, material.emission_texture, textures)
         properties["emitter"] = mi.load_dict({"type": "area", "radiance": radiance})
