@@ -1,40 +1,18 @@
 // Paths start here, and hand in what they gathered when their slot is taken again.
 
+#include "common/camera_ray.h"
 #include "common/features.h"
+#include "common/hand_in.h"
 #include "common/lanes.h"
 #include "common/layout.h"
 #include "common/pixels.h"
 #include "common/pool.h"
 #include "common/rng.h"
 
-/// Exponent bits of the largest of three numbers; tested on bits, for a compiler may assume that no
-/// float is NaN.
-static inline UInt exponent_bits(Vec3 v)
-{
-    return max(as_bits(v.x) & 0x7f800000u, max(as_bits(v.y) & 0x7f800000u, as_bits(v.z) & 0x7f800000u));
-}
-
-// From 2^96 on, a film's sums could overflow.
-#define MAX_EXPONENT_BITS 0x6f800000u
-
 /// Slots that have nothing to do but take the next sample.
 static inline Mask is_free(UInt status)
 {
     return ((status & STATUS_MASK) == STATUS_DONE) | ((status & STATUS_MASK) == STATUS_IDLE);
-}
-
-/// What a work item counts on its way, to disturb the others seldom.
-typedef struct {
-    uint pass;     // of the ring
-    uint finished; // samples of that pass
-    uint started;  // paths
-} Tally;
-
-static inline void hand_in(Tally *tally, volatile __global uint *counters)
-{
-    if (tally->finished > 0)
-        atomic_add(&counters[COUNTER_FINISHED + tally->pass], tally->finished);
-    tally->finished = 0;
 }
 
 /// Regenerate the W paths of a work item.
@@ -132,19 +110,7 @@ static inline uint regenerate(
                     at, (__global float *)beyond);
 #endif
         }
-        Mask uncounted = done;
-        for (uint k = 0; k < W; ++k) {
-            const uint left = lane_bits(uncounted);
-            if (!left)
-                break;
-            const uint counted = lane_pass[lowest_bit(left)];
-            const Mask same = uncounted & (pass == counted);
-            if (counted != tally->pass)
-                hand_in(tally, counters);
-            tally->pass = counted;
-            tally->finished += count_lanes(same);
-            uncounted &= !same;
-        }
+        count_finished(tally, done, pass, counters);
     }
 
     const Mask free = is_free(status);
@@ -182,33 +148,14 @@ static inline uint regenerate(
         Float u2;
         const UInt index = reverse_bits(sample);
         sample_pair(seed, index, (UInt)(PAIR_PIXEL), params->sampler, &u1, &u2);
-        const Float film_x =
-            ((to_float(x) + u1) * (2.0f / (float)params->width) - 1.0f) * params->film_scale_x;
-        const Float film_y =
-            (1.0f - (to_float(y) + u2) * (2.0f / (float)params->height)) * params->film_scale_y;
-        Vec3 origin = vec3_of(params->camera_origin);
-        const Vec3 right = vec3_of(params->camera_right);
-        const Vec3 up = vec3_of(params->camera_up);
-#if LENS == 2
-        Vec3 direction = vec3_of(params->camera_forward);
-        origin = add_scaled(add_scaled(origin, right, film_x), up, film_y);
-#else
-        Vec3 direction =
-            add_scaled(add_scaled(vec3_of(params->camera_forward), right, film_x), up, film_y);
-#endif
+        Float lens_1 = (Float)(0.0f);
+        Float lens_2 = (Float)(0.0f);
 #if LENS == 1
-        // The point that is sharp stays where it is; the origin moves over the lens (Shirley's map).
-        sample_pair(seed, index, (UInt)(PAIR_LENS), params->sampler, &u1, &u2);
-        Float c;
-        Float s;
-        cos_sin_turns(u2, &c, &s);
-        const Float radius = sqrt(u1) * params->lens_radius;
-        const Vec3 shift = add_scaled(scale(right, radius * c), up, radius * s);
-        const Vec3 focus = add_scaled(origin, direction, (Float)(params->focus_distance));
-        origin = add(origin, shift);
-        direction = sub(focus, origin);
+        sample_pair(seed, index, (UInt)(PAIR_LENS), params->sampler, &lens_1, &lens_2);
 #endif
-        direction = normalize3(direction);
+        Vec3 origin;
+        const Vec3 direction =
+            camera_ray(params, to_float(x) + u1, to_float(y) + u2, lens_1, lens_2, &origin);
         const Vec3 zero = vec3_all((Float)(0.0f));
         put_v(path, PATH_ORIGIN_X, pick_v(start, origin, get_v(path, PATH_ORIGIN_X)));
         put_v(path, PATH_DIRECTION_X, pick_v(start, direction, get_v(path, PATH_DIRECTION_X)));

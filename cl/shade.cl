@@ -11,6 +11,7 @@
 #include "common/material.h"
 #include "common/light.h"
 #include "common/sharing.h"
+#include "common/chain.h"
 
 #define MAX_SURVIVAL 0.95f
 
@@ -158,6 +159,9 @@ kernel void shade_paths(
 #endif
 #if CELLS
     __global CellVertex *vertices,
+#endif
+#if METROPOLIS
+    __global float *chains,
 #endif
     __global float *pool)
 {
@@ -345,7 +349,11 @@ kernel void shade_paths(
 #endif
 
     // The seed names the pixel by its place on the film; it travels with the path.
-    const UInt seed = get_u(path, PATH_SEED);
+#if METROPOLIS
+    const Seed seed = path_seed(path, chain_at(params, chains, item));
+#else
+    const Seed seed = get_u(path, PATH_SEED);
+#endif
     const UInt pair = PAIR_VERTEX + depth * VERTEX_PAIRS;
     const UInt index = reverse_bits(sample);
     UInt lobe_bits;

@@ -24,8 +24,19 @@ from psf_cl.scene.model import (
     lets_through,
     shines,
 )
-from psf_cl.settings import Settings
-from psf_cl.stages import camera, cells, connect, film, intersect, screen, seen, shade
+from psf_cl.settings import Settings, check_together
+from psf_cl.stages import (
+    camera,
+    cells,
+    connect,
+    film,
+    intersect,
+    metropolis,
+    screen,
+    seen,
+    shade,
+    splats,
+)
 from psf_cl.stages.spec import BufferSpec, Context, Feature, StageSpec
 from psf_cl.tables import distinct_images, few_triangles, flatten, visible_shapes
 from psf_cl.traits import DeviceTraits
@@ -219,6 +230,10 @@ def make_plan(
         )
     whole_traits, traits = traits, _smaller(traits, halvings)
 
+    check_together(settings)
+    if settings.integrator == "metropolis":
+        _check_metropolis(outputs, halves)
+        traits = dataclasses.replace(traits, slots=metropolis.chain_count(settings, traits))
     shapes = visible_shapes(scene)
     triangles = sum(len(shape.mesh.triangles) for shape in shapes)
     corners = _few_corners(scene, triangles, traits)
@@ -235,6 +250,7 @@ def make_plan(
         _ring(pixel_count, traits, features, RING_BYTES >> halvings),
         statistics=statistics,
         halves=halves,
+        max_depth=settings.max_depth,
         triangle_count=triangles,
         corner_count=corners,
         material_count=len(scene.materials),
@@ -245,7 +261,18 @@ def make_plan(
         else 0,
     )
     stages = []
-    for module in (camera, intersect, shade, connect, cells, seen, film, screen):
+    for module in (
+        camera,
+        metropolis,
+        intersect,
+        shade,
+        connect,
+        cells,
+        splats,
+        seen,
+        film,
+        screen,
+    ):
         stage = module.plan(context)
         if stage is not None:
             stages.append(stage)
@@ -300,6 +327,24 @@ def _mib(count: int) -> str:
     return f"{count / 2**20:.0f}"
 
 
+def _check_metropolis(outputs: frozenset[str], halves: bool) -> None:
+    """Refuse what takes the samples of each pixel.
+
+    Raises:
+        InputError: something does.
+    """
+    if outputs:
+        raise InputError(
+            "--aov: integrator=metropolis has no further images, for its samples belong to no "
+            f"pixel; got {', '.join(sorted(outputs))}"
+        )
+    if halves:
+        raise InputError(
+            "--noise: integrator=metropolis cannot tell its error, for its samples depend on one "
+            "another; expected --spp or --seconds"
+        )
+
+
 def _ring(
     pixel_count: int, traits: DeviceTraits, features: dict[str, Feature], ring_bytes: int
 ) -> int:
@@ -314,6 +359,9 @@ def _ring(
     cell_bytes = 16 + 32 + 36 if features["CELLS"].value else 0
     sample_bytes = 16 * planes + cell_bytes
     wanted = max(8 * traits.slots / pixel_count, 2)
+    if features["METROPOLIS"].value:
+        sample_bytes += layout.SPLAT_SUM.dtype.itemsize
+        wanted = max(metropolis.MUTATIONS_IN_FLIGHT * traits.slots / pixel_count, 2)
     affordable = max(ring_bytes / (sample_bytes * pixel_count), 2)
     ring = 2
     while ring < wanted and ring * 2 <= affordable:
@@ -434,6 +482,11 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "screen_filter is off",
         ),
         "BASE": _base(settings, glossy),
+        "METROPOLIS": switch(
+            settings.integrator == "metropolis",
+            "integrator is metropolis",
+            "integrator is path",
+        ),
     }
 
 
@@ -481,6 +534,11 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     full["FEW"] = Feature(0, f"a tree for measuring, though {features['FEW'].reason}")
     # Other lights would be drawn: another image.
     full["LIGHT_SAMPLING"] = features["LIGHT_SAMPLING"]
+    # Chains are another integrator, which has no images beside the one.
+    full["METROPOLIS"] = features["METROPOLIS"]
+    if features["METROPOLIS"].value:
+        names = ("AOV_DIRECT", "AOV_FEATURES", "BASE", "CELLS", "SEEN")
+        full |= {name: features[name] for name in names}
     return full
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from psf_cl import __version__, tables
+from psf_cl.chains import Chains
 from psf_cl.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from psf_cl.device import layout
 from psf_cl.device.bvh import MIN_STACK_SIZE, Bvh, build_bvh, warm_up_builder
@@ -33,7 +34,7 @@ from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Scene
 from psf_cl.scheduler import Hooks, Progress, Scheduler, doubling_epoch
 from psf_cl.settings import Settings, resolve
-from psf_cl.stages import cells, film, screen
+from psf_cl.stages import cells, film, metropolis, screen
 
 #: Looks of the host at the counters for each count of the paths by depth, which takes 0.4 ms on two
 #: CPU cores; the first look, which is left out, is at a pool that is still empty.
@@ -162,7 +163,7 @@ class Renderer:
             launch(items)
 
     def _film(self) -> None:
-        for launch in self.cell_launches:
+        for launch in (*self.cell_launches, *self.splat_launches):
             launch(self._film_items(1), film.GROUP)
         for launch, planes in self.film_launches:
             launch(self._film_items(planes), film.GROUP)
@@ -194,6 +195,8 @@ class Renderer:
 
     def _between(self, start: int) -> None:
         """Do what the paths of an epoch need that begins with pass ``start``."""
+        if self.chains is not None:
+            self.chains.measure() if start else self.chains.start()
 
     # Frames.
 
@@ -230,7 +233,7 @@ class Renderer:
             counters[layout.COUNTER_INDEX[name]] = first
         self.device.write(self.buffers["counters"], counters)
         names = (name for ring, sums, _ in film.PLANES for name in (ring, sums))
-        for name in ("pool", "film_half", "surfaces_seen", *names):
+        for name in ("pool", "splats", "film_half", "surfaces_seen", *names):
             if name in self.buffers:
                 self.device.fill(self.buffers[name])
 
@@ -502,6 +505,7 @@ class Renderer:
                 "dropped_triangles": self.dropped_triangles,
             },
             "cells": self._cell_statistics(counters),
+            "metropolis": self.chains.statistics() if self.chains else None,
             "bvh": None
             if self.bvh is None
             else {
@@ -650,6 +654,7 @@ class Renderer:
         values |= {new: values[name] for new, name in tables.PREVIOUS_CAMERA.items()}
         values |= cells.parameters(scene, settings, self.plan.pixel_count)
         values |= screen.parameters(settings)
+        values |= metropolis.parameters(settings, self.plan.traits.slots, self.plan.pixel_count)
         for name, value in values.items():
             params[0][name] = value
         return params
@@ -703,6 +708,7 @@ class Renderer:
             for kernel in stage.kernels
         ]
         self._bind_cells(programs.get("cells"))
+        self._bind_chains(programs.get("splats"))
         self.film_program = programs["film"]
         self.film_launches = [
             (self._add_launch(ring, name, planes, partial=False), planes)
@@ -752,6 +758,22 @@ class Renderer:
             [program.bind_planned(name, self.buffers) for name in ("store_cells", "look_up_cells")],
             program.bind_planned("clear_cells", self.buffers),
             program.bind_planned("add_unfiltered", self.buffers),
+        )
+
+    def _bind_chains(self, program: Program | None) -> None:
+        self.splat_launches: list[Launch] = []
+        self.chains: Chains | None = None
+        if program is None:
+            return
+        self.splat_launches = [program.bind_planned("collect_splats", self.buffers)]
+        self.chains = Chains(
+            self.device,
+            self.buffers,
+            self.plan.traits.slots,
+            self.plan.traits.block,
+            self.settings.seed,
+            self._bounce,
+            self._counters,
         )
 
     def _add_launch(self, ring: str, name: str, planes: int, partial: bool) -> Launch:

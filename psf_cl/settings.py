@@ -45,7 +45,17 @@ def _number(default: Any, low: Any, high: Any, *, doc: str) -> Any:
 class Settings:
     """All that changes the estimator.  Anything else (output, device, budget) is not a setting."""
 
-    integrator: str = _choice("path", doc="how paths are built")
+    integrator: str = _choice(
+        "path",
+        "metropolis",
+        doc="independent paths, or chains of paths, each a mutation of the one before",
+    )
+    chains: int = _number(
+        8192, 128, 1 << 22, doc="chains of metropolis, side by side, rounded up to whole blocks"
+    )
+    large_steps: float = _number(
+        0.3, 0.01, 1.0, doc="share of the paths of metropolis that are independent of their chain"
+    )
     light_sampling: str = _choice(
         "power",
         "uniform",
@@ -160,7 +170,27 @@ PRESETS: dict[str, dict[str, Any]] = {
     "pt": {},
     # Shadows of direct light are sharper than any cell; all other light is shared where it is seen.
     "psf": {"path_filter": "hash_grid", "filter_vertex": "1", "filter_direct": False},
+    "mlt": {"integrator": "metropolis"},
 }
+
+
+#: What goes with ``integrator=metropolis``: it has no pixel's samples to share, guide or keep.
+METROPOLIS_NEEDS = {"path_filter": "off", "screen_filter": "off"}
+
+
+def check_together(settings: Settings) -> None:
+    """Refuse settings that exclude one another.
+
+    Raises:
+        InputError: there are some.
+    """
+    if settings.integrator != "metropolis":
+        return
+    for key, value in METROPOLIS_NEEDS.items():
+        if getattr(settings, key) != value:
+            raise InputError(
+                f"settings: integrator=metropolis needs {key}={value}; got {getattr(settings, key)}"
+            )
 
 
 def preset_values(name: str, prefix: str = "settings: ") -> dict[str, Any]:

@@ -23,7 +23,7 @@ ROWS = [
     {"scene", "measure"},
     {"device"},
     {"stages", "tables"},
-    {"plan", "scheduler"},
+    {"chains", "plan", "scheduler"},
     {"renderer"},
     {"cli"},
     {"__init__", "__main__"},

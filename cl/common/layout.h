@@ -27,6 +27,8 @@
 #define DIRECT_BSDF 2u
 #define SAMPLER_SOBOL 0u
 #define SAMPLER_RANDOM 1u
+#define PAIR_VERTEX 2u // first pair of random numbers of the first vertex
+#define VERTEX_PAIRS 4u // pairs of each vertex
 #define STRIP_ROWS 4u // rows of pixels that the queue takes column by column
 #define STATUS_IDLE 0u // the slot has no path yet
 #define STATUS_WAITING 0x40000000u // it holds a sample whose pass may not start yet
@@ -124,6 +126,23 @@
 #endif
 #define PATH_FIELD_COUNT PATH_END_5
 
+#define CHAIN_KNOWN 0u // uint; pairs of numbers of the state from which the path starts; 0: a large step
+#define CHAIN_PAIRS 1u // uint; pairs of numbers that the state has
+#define CHAIN_PATHS 2u // uint; paths that have come to their end
+#define CHAIN_PASS 3u // uint; the pass that the next path counts to
+#define CHAIN_PLACE 4u // uint; its place in it
+#define CHAIN_RADIANCE_R 5u // of the state
+#define CHAIN_RADIANCE_G 6u
+#define CHAIN_RADIANCE_B 7u
+#define CHAIN_PIXEL 8u // uint; of the state, position in the order of pixels
+#define CHAIN_INDEPENDENT 9u // luminance of the paths after large steps, summed
+#define CHAIN_LOST 10u // what that sum lost by rounding
+#define CHAIN_LARGE 11u // uint; large steps
+#define CHAIN_LARGE_ACCEPTED 12u // uint
+#define CHAIN_SMALL 13u // uint; small steps
+#define CHAIN_SMALL_ACCEPTED 14u // uint
+#define CHAIN_NUMBERS 15u // uint; first of the random numbers of the state
+
 #define COUNTER_NEXT_PIXEL 0u // next pixel to be started, counted from the first pixel of next_pass
 #define COUNTER_NEXT_PASS 1u // pass that next_pixel 0 belongs to
 #define COUNTER_FILM_PASS 2u // passes that the film holds
@@ -142,10 +161,12 @@
 #define COUNTER_CELLS_USED_HIGH 15u // high word
 #define COUNTER_CELL_PROBES 16u // low word; slots looked at to find each of these once
 #define COUNTER_CELL_PROBES_HIGH 17u // high word
-#define COUNTER_PENDING_CAMERA 18u // rays since the last film launch
-#define COUNTER_PENDING_BOUNCE 19u
-#define COUNTER_PENDING_SHADOW 20u
-#define COUNTER_FINISHED 21u // first of the ring: samples done of each pass in flight
+#define COUNTER_CHAIN_LIMIT 18u // first path of a chain that must not be started; set by the host
+#define COUNTER_CHAIN_STARTS 19u // paths of chains that ended before the first pass
+#define COUNTER_PENDING_CAMERA 20u // rays since the last film launch
+#define COUNTER_PENDING_BOUNCE 21u
+#define COUNTER_PENDING_SHADOW 22u
+#define COUNTER_FINISHED 23u // first of the ring: samples done of each pass in flight
 
 /// Everything that is the same for all paths of a render.
 typedef struct {
@@ -198,6 +219,10 @@ typedef struct {
     float previous_forward[3]; // unit, world
     float previous_scale_x; // tangent of half the horizontal field of view
     float previous_scale_y; // tangent of half the vertical field of view
+    uint chain_start; // independent paths of each chain, before the first state
+    uint chain_pairs; // pairs of random numbers that a chain keeps
+    float large_steps; // chance of a path of new random numbers
+    float splat_steps; // fixed-point steps of a splat as bright as the mean, a power of two
     uint pad[3]; // fills the record
 } Params;
 
@@ -429,3 +454,10 @@ typedef struct {
     uint high[3]; // of radiance
     uint pad; // fills the record
 } Cell;
+
+/// What the paths of a pass brought to a pixel: 64-bit fixed-point sums.
+typedef struct {
+    uint low[3]; // of radiance
+    uint high[3]; // of radiance
+    uint pad[2]; // fills the record
+} SplatSum;

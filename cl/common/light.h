@@ -190,7 +190,7 @@ LARGE_FUNCTION LightSample sample_light(
 #endif
     Mask active,
     Vec3 origin,
-    UInt seed,
+    Seed seed,
     UInt reversed_index,
     UInt pair,
     LightChoice choice)

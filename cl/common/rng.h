@@ -8,8 +8,6 @@
 // Dimensions come in pairs.  A vertex at `depth` owns VERTEX_PAIRS of them from PAIR_VERTEX on.
 #define PAIR_PIXEL 0u
 #define PAIR_LENS 1u
-#define PAIR_VERTEX 2u
-#define VERTEX_PAIRS 4u
 // Pairs beyond those of any vertex: where a sample is moved to before it is told apart by cells.
 #define PAIR_CELL_STORE 0xfffffff0u
 #define PAIR_CELL_LOOK_UP 0xfffffff1u
@@ -72,13 +70,24 @@ static inline Float unit_float(UInt x) { return to_float(x >> 8) * 5.9604645e-8f
 /// What tells pixels apart; `pixel` counts over the whole film, so a crop has the same numbers.
 static inline UInt pixel_seed(UInt pixel, uint seed) { return mix_bits(pixel ^ mix_bits((UInt)(seed ^ 0x9e3779b9u))); }
 
+/// Two uniform 32-bit numbers for a `key` of the seed and the pair.
+static inline void random_bits(UInt key, UInt index, UInt *first, UInt *second)
+{
+    const UInt number = mix_bits(index + key);
+    *first = mix_bits(number ^ 0x68bc21ebu);
+    *second = mix_bits(number ^ 0x02e5be93u);
+}
+
+/// What the numbers of a pair of dimensions depend on, beside the index of the sample.
+static inline UInt pair_key(UInt seed, UInt pair) { return mix_bits(seed + pair * 0x9e3779b9u); }
+
 /// Two uniform 32-bit numbers, stratified over the samples of a pixel if the sampler is Sobol'.
 ///
 /// `reversed_index` is the sample's index with its bits reversed: once for all pairs of a vertex.
-LARGE_FUNCTION void sample_bits(
+LARGE_FUNCTION void new_bits(
     UInt seed, UInt reversed_index, UInt pair, uint sampler, UInt *first, UInt *second)
 {
-    const UInt key = mix_bits(seed + pair * 0x9e3779b9u);
+    const UInt key = pair_key(seed, pair);
     if (sampler == SAMPLER_SOBOL) {
         const UInt shuffled = reverse_bits(scramble_reversed(reversed_index, key));
         // Seeds of their own for both digits' scrambles: rotations of a mixed number.
@@ -86,14 +95,60 @@ LARGE_FUNCTION void sample_bits(
         *second =
             reverse_bits(scramble_reversed(sobol_reversed(shuffled), rotate(key, (UInt)(22u)) ^ 0x02e5be93u));
     } else {
-        const UInt number = mix_bits(reversed_index + key);
-        *first = mix_bits(number ^ 0x68bc21ebu);
-        *second = mix_bits(number ^ 0x02e5be93u);
+        random_bits(key, reversed_index, first, second);
     }
 }
 
+#if METROPOLIS
+/// What the numbers of a path are a function of, beside its chain, which is its sample.
+typedef struct {
+    UInt key;                     // of the number of the path in its chain
+    UInt known;                   // pairs of numbers of the chain's state; 0: all of the path's are new
+    __global const uint *numbers; // of the states of the W chains
+} Seed;
+
+/// A number a bit further on, or back, on the circle from 0 to 2^32: steps of 2^-10 to 2^-6 of it, each
+/// octave as likely as any other.
+///
+/// Kelemen et al.: A Simple and Robust Mutation Strategy for the Metropolis Light Transport Algorithm, 2002.
+static inline UInt mutated(UInt number, UInt random)
+{
+    // Random mantissas and two random bits of the exponent.
+    const UInt distance = to_uint(from_bits(0x3a800000u + (random >> 7)) * 0x1p32f);
+    return number + pick_u((random & 1u) != 0u, distance, -distance);
+}
+
+/// Two uniform 32-bit numbers: those of the chain's state, mutated, or new ones.
+LARGE_FUNCTION void sample_bits(
+    Seed seed, UInt reversed_index, UInt pair, uint sampler, UInt *first, UInt *second)
+{
+    const Mask known = pair < seed.known;
+    *first = (UInt)(0u);
+    *second = (UInt)(0u);
+    if (any_lane(!known))
+        new_bits(seed.key, reversed_index, pair, sampler, first, second);
+    if (any_lane(known)) {
+        const UInt at = pick_u(known, pair, (UInt)(0u)) * (2u * BLOCK) + lanes_before(MASK_ALL);
+        UInt a;
+        UInt b;
+        random_bits(pair_key(seed.key, pair), reversed_index, &a, &b);
+        *first = pick_u(known, mutated(GATHER_WORD(seed.numbers, at), a), *first);
+        *second = pick_u(known, mutated(GATHER_WORD(seed.numbers, at + BLOCK), b), *second);
+    }
+}
+#else
+/// What the numbers of a path are a function of, beside its sample: its pixel.
+typedef UInt Seed;
+
+static inline void sample_bits(
+    Seed seed, UInt reversed_index, UInt pair, uint sampler, UInt *first, UInt *second)
+{
+    new_bits(seed, reversed_index, pair, sampler, first, second);
+}
+#endif
+
 /// Two uniform numbers in [0, 1).
-static inline void sample_pair(UInt seed, UInt reversed_index, UInt pair, uint sampler, Float *first, Float *second)
+static inline void sample_pair(Seed seed, UInt reversed_index, UInt pair, uint sampler, Float *first, Float *second)
 {
     UInt a;
     UInt b;

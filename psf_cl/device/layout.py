@@ -116,6 +116,11 @@ PARAMS = Record(
     float previous_forward[3] - unit, world
     float previous_scale_x - tangent of half the horizontal field of view
     float previous_scale_y - tangent of half the vertical field of view
+    uint chain_start - independent paths of each chain, before the first state
+    uint chain_pairs - pairs of random numbers that a chain keeps
+    float large_steps - chance of a path of new random numbers
+    float splat_steps - fixed-point steps of a splat as bright as the mean, a power of two
+    uint pad[3] - fills the record
     """),
 )
 
@@ -411,6 +416,16 @@ CELL = Record(
     """),
 )
 
+SPLAT_SUM = Record(
+    "SplatSum",
+    "What the paths of a pass brought to a pixel: 64-bit fixed-point sums.",
+    _fields("""
+    uint low[3] - of radiance
+    uint high[3] - of radiance
+    uint pad[2] - fills the record
+    """),
+)
+
 RECORDS = (
     PARAMS,
     BVH_NODE,
@@ -434,6 +449,7 @@ RECORDS = (
     CELL_VERTEX,
     BEYOND,
     CELL,
+    SPLAT_SUM,
 )
 
 #: Words of every path's state, in the order in which they lie in a block of the pool.
@@ -529,6 +545,26 @@ OPTIONAL_PATH_FIELDS = (
     ),
 )
 
+#: Words of every chain, in the order in which they lie in a block of chains.
+CHAIN_FIELDS = (
+    ("known", "uint; pairs of numbers of the state from which the path starts; 0: a large step"),
+    ("pairs", "uint; pairs of numbers that the state has"),
+    ("paths", "uint; paths that have come to their end"),
+    ("pass", "uint; the pass that the next path counts to"),
+    ("place", "uint; its place in it"),
+    ("radiance_r", "of the state"),
+    ("radiance_g", ""),
+    ("radiance_b", ""),
+    ("pixel", "uint; of the state, position in the order of pixels"),
+    ("independent", "luminance of the paths after large steps, summed"),
+    ("lost", "what that sum lost by rounding"),
+    ("large", "uint; large steps"),
+    ("large_accepted", "uint"),
+    ("small", "uint; small steps"),
+    ("small_accepted", "uint"),
+    ("numbers", "uint; first of the random numbers of the state"),
+)
+
 #: Words of the counters, all uint.
 COUNTERS = (
     ("next_pixel", "next pixel to be started, counted from the first pixel of next_pass"),
@@ -549,6 +585,8 @@ COUNTERS = (
     ("cells_used_high", "high word"),
     ("cell_probes", "low word; slots looked at to find each of these once"),
     ("cell_probes_high", "high word"),
+    ("chain_limit", "first path of a chain that must not be started; set by the host"),
+    ("chain_starts", "paths of chains that ended before the first pass"),
     ("pending_camera", "rays since the last film launch"),
     ("pending_bounce", ""),
     ("pending_shadow", ""),
@@ -582,6 +620,8 @@ CONSTANTS = (
     ("DIRECT_BSDF", 2, ""),
     ("SAMPLER_SOBOL", 0, ""),
     ("SAMPLER_RANDOM", 1, ""),
+    ("PAIR_VERTEX", 2, "first pair of random numbers of the first vertex"),
+    ("VERTEX_PAIRS", 4, "pairs of each vertex"),
     ("STRIP_ROWS", 4, "rows of pixels that the queue takes column by column"),
     ("STATUS_IDLE", 0, "the slot has no path yet"),
     ("STATUS_WAITING", 0x40000000, "it holds a sample whose pass may not start yet"),
@@ -606,6 +646,8 @@ _FRAME = """\
 {constants}
 
 {paths}
+
+{chains}
 
 {counters}
 
@@ -638,6 +680,13 @@ def _path_lines() -> list[str]:
     return [*lines, _define("PATH_FIELD_COUNT", end)]
 
 
+def _chain_lines() -> list[str]:
+    return [
+        _define(f"CHAIN_{name.upper()}", f"{index}u", meaning)
+        for index, (name, meaning) in enumerate(CHAIN_FIELDS)
+    ]
+
+
 def path_field_count(values: Mapping[str, int]) -> int:
     """Return the words of a path's state under the ``values`` of the features."""
     return len(PATH_FIELDS) + sum(
@@ -656,6 +705,7 @@ def header() -> str:
     return _FRAME.format(
         constants="\n".join(define(*constant) for constant in CONSTANTS),
         paths="\n".join(_path_lines()),
+        chains="\n".join(_chain_lines()),
         counters="\n".join(
             define(f"COUNTER_{name.upper()}", index, meaning)
             for index, (name, meaning) in enumerate(COUNTERS)
@@ -665,6 +715,8 @@ def header() -> str:
 
 
 COUNTER_INDEX = {name: index for index, (name, _) in enumerate(COUNTERS)}
+CHAIN_INDEX = {name: index for index, (name, _) in enumerate(CHAIN_FIELDS)}
+
 #: What rays are traced for.
 RAY_KINDS = ("camera", "bounce", "shadow")
 

@@ -8,12 +8,12 @@ from psf_cl.device import layout
 from psf_cl.stages.spec import POOL_FLAGS, BufferSpec, Context, KernelSpec, StageSpec
 
 
-def plan(context: Context) -> StageSpec:
-    """Return the stage; every render has it."""
+def pool_buffers(context: Context) -> list[BufferSpec]:
+    """Return what holds the paths, wherever they start, and what they bring."""
     slots = context.traits.slots
     samples = context.ring * context.pixel_count * 4
     float32, uint32 = np.dtype(np.float32), np.dtype(np.uint32)
-    buffers = [
+    return [
         BufferSpec(
             "pool", float32, slots * context.path_field_count, f"state of {slots} paths", True
         ),
@@ -24,15 +24,25 @@ def plan(context: Context) -> StageSpec:
             "samples", float32, samples, f"radiance of {context.ring} passes in flight", True
         ),
     ]
+
+
+def plan(context: Context) -> StageSpec | None:
+    """Return the stage, or None if paths start from those before them."""
+    if context.on("METROPOLIS"):
+        return None
+    samples = context.ring * context.pixel_count * 4
+    buffers = pool_buffers(context)
     direct: tuple[str, ...] = ()
     if context.on("AOV_DIRECT"):
         direct = ("direct",)
-        buffers.append(BufferSpec("direct", float32, samples, "direct light of the same", True))
+        buffers.append(
+            BufferSpec("direct", np.dtype(np.float32), samples, "direct light of the same", True)
+        )
     base: tuple[str, ...] = ()
     if context.on("BASE"):
         base = ("base",)
         what = "what first surfaces reflect of the same"
-        buffers.append(BufferSpec("base", float32, samples, what, True))
+        buffers.append(BufferSpec("base", np.dtype(np.float32), samples, what, True))
     shared = ("beyond", "vertex") if context.on("CELLS") else ()
     started = ("origin", "direction", "beta", "radiance", *direct, *base, "seed", "status")
     named = ("sample", "pixel")

@@ -43,6 +43,7 @@ def plan(context: Context) -> StageSpec:
             "AOV_FEATURES",
             "SEEN",
             *POOL_FLAGS,
+            "METROPOLIS",
         ),
         kernels=(_kernel(context),),
         buffers=tuple(buffers),

@@ -127,6 +127,7 @@ class Context:
     traits: DeviceTraits
     pixel_count: int
     ring: int
+    max_depth: int = 0
     texel_count: int = 1
     environment_count: int = 0
     triangle_count: int = 0

@@ -1,0 +1,48 @@
+// Finished paths: what they bring has to be finite, and their pass counts them.
+#pragma once
+
+#include "lanes.h"
+#include "layout.h"
+
+/// Exponent bits of the largest of three numbers; tested on bits, for a compiler may assume that no
+/// float is NaN.
+static inline UInt exponent_bits(Vec3 v)
+{
+    return max(as_bits(v.x) & 0x7f800000u, max(as_bits(v.y) & 0x7f800000u, as_bits(v.z) & 0x7f800000u));
+}
+
+// From 2^96 on, a film's sums could overflow.
+#define MAX_EXPONENT_BITS 0x6f800000u
+
+/// What a work item counts on its way, to disturb the others seldom.
+typedef struct {
+    uint pass;     // of the ring
+    uint finished; // samples of that pass
+    uint started;  // paths
+} Tally;
+
+static inline void hand_in(Tally *tally, volatile __global uint *counters)
+{
+    if (tally->finished > 0)
+        atomic_add(&counters[COUNTER_FINISHED + tally->pass], tally->finished);
+    tally->finished = 0;
+}
+
+/// Count the samples of the lanes in `done` to their passes of the ring.
+static inline void count_finished(Tally *tally, Mask done, UInt pass, volatile __global uint *counters)
+{
+    uint lane_pass[W];
+    store_lanes_u(pass, lane_pass);
+    for (uint k = 0; k < W; ++k) {
+        const uint left = lane_bits(done);
+        if (!left)
+            break;
+        const uint counted = lane_pass[lowest_bit(left)];
+        const Mask same = done & (pass == counted);
+        if (counted != tally->pass)
+            hand_in(tally, counters);
+        tally->pass = counted;
+        tally->finished += count_lanes(same);
+        done &= !same;
+    }
+}
