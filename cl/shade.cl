@@ -13,7 +13,7 @@
 #include "common/sharing.h"
 #include "common/chain.h"
 
-#define MAX_SURVIVAL 0.95f
+#define MAX_SURVIVAL 0.999f
 
 /// Weight of emission that a BSDF-sampled ray found, against sampling the light.
 static inline Float emission_weight(__global const Params *params, Mask camera_ray, Float pdf_bsdf, Float pdf_light)
@@ -434,7 +434,14 @@ kernel void shade_paths(
     Mask survives = goes_on & (pdf > 0.0f) & (carried > 0.0f) & !broken;
 
     const Mask roulette = (depth + 1u) > params->roulette_depth;
-    const Float chance = pick(roulette, min(max3(beta), (Float)(MAX_SURVIVAL)), (Float)(1.0f));
+    Float worth = max3(beta);
+#if TRANSMISSION
+    // Inside of glass beta is smaller by eta^2 and will be larger again: that is no reason to end.
+    const Mask within = (b.transmission > 0.0f) & !b.thin
+                        & (((drawn.z < 0.0f) & (b.eta > 1.0f)) | ((drawn.z > 0.0f) & (b.eta < 1.0f)));
+    worth *= pick(within, max(b.eta * b.eta, 1.0f / (b.eta * b.eta)), (Float)(1.0f));
+#endif
+    const Float chance = pick(roulette, min(worth, (Float)(MAX_SURVIVAL)), (Float)(1.0f));
     survives &= left_of_choice(chances, u_lobe) < chance;
     beta = scale(beta, 1.0f / pick(survives, chance, (Float)(1.0f)));
 

@@ -30,6 +30,7 @@ from psf_cl.image import Image
 from psf_cl.measure.errors import error_of_halves
 from psf_cl.plan import Plan, Room, make_plan
 from psf_cl.scene.digest import scene_digest
+from psf_cl.scene.far import far_from_origin, moved
 from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Scene
 from psf_cl.scheduler import Hooks, Progress, Scheduler, doubling_epoch
@@ -76,7 +77,8 @@ class Renderer:
         halves: bool = False,
         room: Room | None = None,
     ) -> None:
-        self.scene = scene
+        self.far = far_from_origin(scene)
+        self.scene = scene = scene if self.far is None else moved(scene, -self.far)
         self.settings = settings or resolve(scene.render, scene.path)
         if not scene.cameras:
             raise InputError(f"{scene.path}: no camera")
@@ -540,6 +542,11 @@ class Renderer:
     def notes(self) -> tuple[str, ...]:
         """What a user should know that only building the scene has shown, one sentence each."""
         notes = []
+        if self.far is not None:
+            notes.append(
+                f"the scene lies {np.linalg.norm(self.far):.3g} m away from the origin: it is "
+                "rendered as if it were there"
+            )
         if self.dropped_triangles:
             notes.append(
                 f"{self.dropped_triangles} triangles are left out: a coordinate is not finite"
@@ -620,6 +627,9 @@ class Renderer:
         params = np.zeros(1, layout.PARAMS.dtype)
         values: dict[str, Any] = tables.camera_values(
             scene.cameras[scene.camera], scene.width, scene.height
+        )
+        values["camera_origin"] = tables.off_surfaces(
+            values["camera_origin"], values["camera_forward"], geometry.surfaces
         )
         image = scene.environment.image
         values |= {

@@ -606,6 +606,35 @@ def pixel_order(width: int, height: int) -> np.ndarray:
     return np.concatenate(strips)
 
 
+def off_surfaces(origin: np.ndarray, forward: np.ndarray, surfaces: np.ndarray) -> np.ndarray:
+    """Return a camera's place, moved off the triangles that it lies on.
+
+    A ray that starts on a triangle may meet it or not, as rounding has it.  Like rays that leave a
+    surface it is to start on the side that it goes to: here the side that the camera looks to.
+
+    Args:
+        origin, forward: ``(3,)``, world; m and unit.
+        surfaces: ``(n,)`` layout.SURFACE.
+    """
+    place = np.asarray(origin, np.float64)
+    normals = surfaces["ng"].astype(np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        away = ((place - surfaces["p0"]) * normals).sum(axis=1)
+        near = np.flatnonzero(np.abs(away) <= surfaces["offset"])
+    for triangle in near:
+        surface, normal = surfaces[triangle], normals[triangle]
+        edges = np.stack([surface["e1"], surface["e2"], normal]).astype(np.float64)
+        if np.linalg.matrix_rank(edges) < 3:
+            continue
+        u, v, _ = np.linalg.solve(edges.T, place - surface["p0"])
+        if min(u, v, 1.0 - u - v) < -1e-4:
+            continue
+        side = 1.0 if normal @ np.asarray(forward, np.float64) >= 0.0 else -1.0
+        distance = (place - surface["p0"]) @ normal
+        place = place + normal * (2.0 * side * float(surface["offset"]) - distance)
+    return place
+
+
 def camera_values(camera: Camera, width: int, height: int) -> dict[str, object]:
     """Return the camera's fields of layout.PARAMS."""
     matrix = camera.transform

@@ -125,9 +125,10 @@ def test_white_bowl_looks_like_its_environment(device, environment, direct_sampl
         roulette_depth=40,
     )
     np.testing.assert_allclose(image.rgb.mean(), 1.0, rtol=0.005)
-    # A block of sky has neither noise nor error.
+    # A block of sky has neither noise nor error; roulette ends so few paths that samples do not
+    # show how much that adds.
     deviation, variance = luminance_blocks(image, 4)
-    assert (np.abs(deviation - 1.0) <= Z_LIMIT * np.sqrt(variance) + 1e-5).all()
+    assert (np.abs(deviation - 1.0) <= Z_LIMIT * np.sqrt(variance) + 1e-4).all()
     assert np.sqrt(variance).max() < 0.01
 
 

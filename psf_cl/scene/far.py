@@ -1,0 +1,52 @@
+"""Scenes far away from the origin, where single precision has no digits left for their shapes."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+
+from psf_cl.scene import transform
+from psf_cl.scene.model import Scene
+
+#: A scene is far away if the origin is so many times as far from its middle as its corners are.
+#: Coordinates have 24 bits: as far out as this they still have 22 for what is in the scene.
+FAR = 4.0
+
+
+def far_from_origin(scene: Scene) -> np.ndarray | None:
+    """Return the middle of a scene that is far away from the origin, ``(3,)`` float64, else None.
+
+    Transforms are double precision, so that a scene loses nothing by being moved; vertices that
+    were read as far-away numbers of single precision have lost their digits before.
+    """
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for shape in scene.shapes:
+        points = shape.mesh.positions[np.isfinite(shape.mesh.positions).all(axis=1)]
+        if not len(points):
+            continue
+        box = np.stack([points.min(axis=0), points.max(axis=0)]).astype(np.float64)
+        corners = np.array(list(itertools.product(*box.T)))
+        with np.errstate(all="ignore"):
+            world = corners @ shape.transform[:3, :3].T + shape.transform[:3, 3]
+        if np.isfinite(world).all():
+            low, high = np.minimum(low, world.min(axis=0)), np.maximum(high, world.max(axis=0))
+    if not (low <= high).all():
+        return None
+    middle, radius = (low + high) / 2.0, float(np.linalg.norm(high - low)) / 2.0
+    return middle if np.linalg.norm(middle) > FAR * radius > 0.0 else None
+
+
+def moved(scene: Scene, by: np.ndarray) -> Scene:
+    """Return the scene with everything that has a place in it moved ``by`` meters, ``(3,)``."""
+    shift = transform.translation(by)
+    return replace(
+        scene,
+        shapes=tuple(replace(s, transform=shift @ s.transform) for s in scene.shapes),
+        cameras=tuple(replace(c, transform=shift @ c.transform) for c in scene.cameras),
+        lights=tuple(
+            replace(light, position=tuple((np.asarray(light.position) + by).tolist()))
+            for light in scene.lights
+        ),
+    )

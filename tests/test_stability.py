@@ -1,0 +1,129 @@
+"""Extremes that once failed, and the table that finds them."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import itertools
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scene_builder import build, camera, floor, glowing, inside_out, lambertian, render, renderer
+
+from psf_cl.scene import primitives, transform
+from psf_cl.scene.far import far_from_origin, moved
+from psf_cl.scene.model import Material
+
+ROOT = Path(__file__).resolve().parents[1]
+VIEW = camera((0.0, 0.0, 0.95), (0.0, -0.2, -1.0), 60.0)
+
+
+@pytest.fixture(scope="module")
+def tool():
+    """Return ``tools/stability.py`` as a module."""
+    sys.path.insert(0, str(ROOT / "tools"))
+    try:
+        yield importlib.import_module("stability")
+    finally:
+        sys.path.remove(str(ROOT / "tools"))
+
+
+def furnace(albedo=0.5, depth=16, view=VIEW):
+    """Return a closed box in which paths of ``depth`` bounces bring radiance 1."""
+    glow = 1.0 / sum(albedo**k for k in range(depth + 1))
+    return build([(inside_out(primitives.box()), np.eye(4), glowing(glow, albedo))], view, (16, 16))
+
+
+def lit_floor():
+    lamp = transform.translation((0, 2, 0)) @ transform.rotation_xyz_degrees((180, 0, 0))
+    return build(
+        [
+            floor(2.0, lambertian(0.5)),
+            (primitives.box(), transform.scaling(0.4), lambertian(0.8)),
+            (primitives.quad(), lamp @ transform.scaling(0.3), glowing((8.0, 6.0, 4.0))),
+        ],
+        camera((0, 1.5, 3), (0, 0.3, 0), 45),
+        (24, 16),
+    )
+
+
+def test_a_scene_a_thousand_kilometers_away_looks_as_it_does_at_home(device):
+    """At 1e6 m a float has steps of 6 cm."""
+    scene = lit_floor()
+    away = np.array([1e6, -1e6, 0.7e6])
+    assert far_from_origin(scene) is None
+    middle = far_from_origin(moved(scene, away))
+    np.testing.assert_allclose(middle, away + np.array([0.0, 0.8, 0.0]), atol=1e-9)
+    at_home = render(device, moved(scene, [0.0, -0.8, 0.0]), 16)
+    opened = renderer(device, moved(scene, away))
+    opened.render(spp=16)
+    assert "m away from the origin" in opened.notes[0]
+    np.testing.assert_allclose(opened.image().rgb, at_home.rgb, rtol=1e-3, atol=1e-4)
+    opened.close()
+
+
+@pytest.mark.parametrize("place", [(0.2, -1.0, 0.3), (-1.0, -1.0, -1.0)], ids=["wall", "corner"])
+def test_a_camera_on_a_wall_sees_what_is_before_the_wall(device, place):
+    image = render(device, furnace(view=camera(place, (0.0, 0.0, 0.1), 60.0)), 64)
+    np.testing.assert_allclose(image.rgb.mean(), 1.0, rtol=0.01)
+    # A ray that met the wall it starts on would see nothing of the room.
+    assert image.rgb.min() > 0.8
+
+
+@pytest.mark.parametrize("albedo", [0.99, 1.0])
+def test_roulette_adds_little_noise_to_paths_of_a_thousand_bounces(device, albedo):
+    """Ending one in twenty of paths that carry everything made a few worth 10^3 times the rest."""
+    image = render(device, furnace(albedo, 1000), 16, max_depth=1000)
+    assert image.rgb.max() < 3.0
+    np.testing.assert_allclose(image.rgb.mean(), 1.0, rtol=0.05)
+
+
+def test_roulette_does_not_take_the_step_into_glass_for_a_loss(device):
+    """Inside of glass of index 5 a path carries a 25th, until it leaves."""
+    ball = dataclasses.replace(primitives.sphere(24, 12), normals=None)
+    glass = Material(base_color=(1.0, 1.0, 1.0), transmission=1.0, ior=5.0, roughness=0.0)
+    scene = build(
+        [(ball, np.eye(4), glass)], camera((0, 0.3, 3), (0, 0, 0), 45), (16, 16), environment=1.0
+    )
+    with_roulette = render(device, scene, 32, ["variance"], max_depth=64, sampler="random")
+    without = render(
+        device, scene, 32, ["variance"], max_depth=64, sampler="random", termination="off"
+    )
+    noise = [np.mean(image.aovs["variance"]) for image in (with_roulette, without)]
+    assert noise[0] < 1.5 * noise[1]
+
+
+def test_all_pairs_of_values_meet_in_some_row(tool):
+    values = {"a": [1, 2, 3], "b": ["x", "y"], "c": [False, True], "d": [0.5], "e": list(range(7))}
+    rows = tool.pairwise_rows(values)
+    assert len(rows) < 3 * 2 * 2 * 7  # Far fewer than all combinations.
+    for one, other in itertools.combinations(values, 2):
+        met = {(row[one], row[other]) for row in rows}
+        assert met == set(itertools.product(values[one], values[other]))
+
+
+def test_a_table_without_a_case_or_a_column_is_not_whole(tool):
+    whole = dict.fromkeys(tool.COLUMNS, "") | {"case": "room", "preset": "pt"}
+    assert tool.missing_rows([whole], [("room", "pt")]) == []
+    assert tool.missing_rows([whole], [("room", "pt"), ("glass", "pt")]) == ["glass with pt"]
+    del whole["counters"]
+    assert tool.missing_rows([whole], [("room", "pt")]) == ["counters"]
+
+
+def test_the_table_tells_good_from_bad(tool, device, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(tool, "open_device", lambda name: device)
+    case = tool.CASES[[case.name for case in tool.CASES].index("depth 1")]
+    cases = [case, dataclasses.replace(case, name="depth 1, wrong", truth=1.05)]
+    cases += [dataclasses.replace(case, name="depth 1, refused", settings={"max_depth": -1})]
+    monkeypatch.setattr(tool, "CASES", cases)
+    arguments = "--presets pt --cases depth --edge 16 --no-times --spp 256 -o".split()
+    assert tool.main([*arguments, str(tmp_path)]) == 1
+    assert "3 rows, 2 failed, 0 missing" in capsys.readouterr().out
+    text = (tmp_path / "stability.csv").read_text()
+    good, wrong, refused = text.splitlines()[1:]
+    assert good.startswith("depth 1,pt,ok,")
+    assert "FAILED,the mean is off," in wrong and "max_depth must be from 0" in refused
+    page = (tmp_path / "stability.html").read_text()
+    assert page.count("<tr") == 4 and page.count("class=failed") == 2

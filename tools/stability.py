@@ -1,0 +1,429 @@
+"""A table of extremes: ``python tools/stability.py [-o FOLDER] [--presets a,b] [--cases TEXT]``.
+
+Every case of ``stability_cases.py`` is rendered with every preset, and all pairs of values of the
+settings with a small room.  A row fails if a pixel is not finite, a sample was rejected, the mean
+is not what is known (0.2 % and three standard errors; 2 % where the estimator is biased), a pixel
+is far brighter than it can be, or a sample takes more than twice the processor time of the calm
+case.  A case that is missing, a refusal where none is due and an exception fail too.
+
+``stability.csv`` and ``stability.html`` are written to the folder.  The exit code is 1 if anything
+failed.  Presets come from ``psf_cl.settings``: new ones are in the table by themselves.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import csv
+import dataclasses
+import html
+import io
+import itertools
+import math
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from stability_cases import CASES, Case, room
+
+from psf_cl.cli.common import positive_integer
+from psf_cl.device.device import Device, open_device
+from psf_cl.errors import DeviceError, InputError
+from psf_cl.files import write_whole
+from psf_cl.image import Image
+from psf_cl.renderer import Renderer
+from psf_cl.scene.model import LUMINANCE, Scene
+from psf_cl.settings import PRESETS, Settings, resolve
+
+EDGE = 48
+SPP = 64
+
+#: Of the mean, beside three standard errors.
+UNBIASED, BIASED = 0.002, 0.02
+MOST_TIME = 2.0
+MOST_SECONDS = 120.0
+
+#: Processor time below which a ratio says nothing.
+LEAST_SECONDS = 0.2
+
+#: Settings whose values other than the default bias an image of finitely many samples.
+BIASING = ("path_filter", "temporal", "screen_filter")
+BIASING_VALUES = {"termination": ("cache",)}
+
+PAIRS = "pairs of settings"
+
+COLUMNS = (
+    "case",
+    "preset",
+    "verdict",
+    "why",
+    "not finite",
+    "rejected",
+    "mean",
+    "truth",
+    "error",
+    "allowed",
+    "largest",
+    "most allowed",
+    "ns a sample",
+    "of calm",
+    "counters",
+)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What one render came to.
+
+    Attributes:
+        error: standard error of the mean.
+        seconds: processor time of rendering, of all threads.
+    """
+
+    bad: int
+    rejected: int
+    mean: float
+    error: float
+    largest: float
+    samples: int
+    seconds: float
+    counters: Mapping[str, Any]
+
+    @property
+    def ns(self) -> float:
+        return self.seconds / max(self.samples, 1) * 1e9
+
+
+class TooSlowError(Exception):
+    """A render took more than MOST_SECONDS."""
+
+
+def is_biased(settings: Settings) -> bool:
+    """Say whether the mean of an image may be off by more than noise."""
+    default = Settings()
+    changed = [getattr(settings, n, None) != getattr(default, n, None) for n in BIASING]
+    return any(changed) or any(
+        getattr(settings, name, None) in values for name, values in BIASING_VALUES.items()
+    )
+
+
+def picture(device: Device, scene: Scene, settings: Settings, spp: int) -> Picture:
+    """Render and sum up.
+
+    Raises:
+        TooSlowError: it did not end in time.
+        DeviceError, InputError: as the renderer does.
+    """
+    with contextlib.closing(Renderer(scene, settings, device, outputs=("variance",))) as renderer:
+        begin, start = time.perf_counter(), time.process_time()
+        if not renderer.render(
+            spp=spp, progress=lambda now: time.perf_counter() - begin < MOST_SECONDS
+        ):
+            raise TooSlowError(f"not done after {MOST_SECONDS:.0f} s")
+        device.wait()
+        seconds = time.process_time() - start
+        return summed_up(renderer.image(), seconds)
+
+
+def summed_up(image: Image, seconds: float) -> Picture:
+    """Return what a row of the table tells of an image."""
+    rgb = image.rgb.astype(np.float64)
+    luminance = rgb @ LUMINANCE
+    finite = np.isfinite(rgb).all(axis=-1)
+    variance = float(image.aovs["variance"].astype(np.float64).mean())
+    stats = image.stats
+    counters = {
+        name: value for name, value in stats["counters"].items() if name != "rejected_samples"
+    } | (stats.get("cells") or {})
+    return Picture(
+        bad=int((~finite).sum()),
+        rejected=stats["counters"]["rejected_samples"],
+        mean=float(luminance[finite].mean()) if finite.any() else math.nan,
+        error=math.sqrt(variance / luminance.size),
+        largest=float(np.where(finite, luminance, 0.0).max()),
+        samples=stats["spp"] * luminance.size,
+        seconds=seconds,
+        counters={k: v for k, v in counters.items() if v},
+    )
+
+
+class Bench:
+    """Renders cases with presets and compares them.
+
+    Calm pictures are made once: those to look like with ``pt`` and four times the samples.
+    """
+
+    def __init__(self, device: Device, edge: int, spp: int, timed: bool) -> None:
+        self.device = device
+        self.edge = edge
+        self.spp = spp
+        self.timed = timed
+        self.cases = {case.name: case for case in CASES}
+        self.truths: dict[str, Picture] = {}
+        self.calm: dict[tuple[str, str], Picture] = {}
+
+    def scene(self, case: Case) -> Scene:
+        scene = case.scene(self.edge)
+        if case.size is not None:
+            scene = dataclasses.replace(scene, width=case.size[0], height=case.size[1])
+        return scene
+
+    def settings(self, case: Case, preset: str) -> Settings:
+        return resolve({}, case.name, preset, case.settings)
+
+    def render(self, case: Case, preset: str, factor: float = 1.0) -> Picture:
+        spp = case.own_spp or max(round(self.spp * case.spp * factor), 1)
+        return picture(self.device, self.scene(case), self.settings(case, preset), spp)
+
+    def truth(self, case: Case) -> tuple[float, float, float]:
+        """Return mean, its standard error and the largest pixel of what the case looks like."""
+        if not isinstance(case.truth, str):
+            return case.truth, 0.0, case.truth
+        name, _, scale = case.truth.partition(" * ")
+        if name not in self.truths:
+            self.truths[name] = self.render(self.cases[name], "pt", 4.0)
+        known, factor = self.truths[name], float(scale or 1.0)
+        return known.mean * factor, known.error * factor, known.largest * factor
+
+    def row(self, case: Case, preset: str) -> dict[str, Any]:
+        """Return one row of the table."""
+        row: dict[str, Any] = dict.fromkeys(COLUMNS, "") | {"case": case.name, "preset": preset}
+        try:
+            seen = self.render(case, preset)
+            truth, error, largest = self.truth(case)
+            ratio, seen = self._time(case, preset, seen)
+        except (TooSlowError, DeviceError, InputError) as failure:
+            return row | {"verdict": "FAILED", "why": f"{type(failure).__name__}: {failure}"}
+        share = BIASED if is_biased(self.settings(case, preset)) else UNBIASED
+        allowed = max(share, case.tolerance) * abs(truth) + 3.0 * math.hypot(seen.error, error)
+        most = math.inf if case.fireflies is None else case.fireflies * largest
+        failures = {
+            f"{seen.bad} pixels are not finite": seen.bad > 0,
+            f"{seen.rejected} samples rejected": seen.rejected > 0,
+            "the mean is off": not abs(seen.mean - truth) <= allowed,
+            "a pixel is too bright": not seen.largest <= most + allowed,
+            "it is too slow": ratio is not None and ratio > MOST_TIME,
+        }
+        why = "; ".join(text for text, failed in failures.items() if failed)
+        return row | {
+            "verdict": "FAILED" if why else "ok",
+            "why": why,
+            "not finite": seen.bad,
+            "rejected": seen.rejected,
+            "mean": seen.mean,
+            "truth": truth,
+            "error": seen.mean - truth,
+            "allowed": allowed,
+            "largest": seen.largest,
+            "most allowed": most,
+            "ns a sample": round(seen.ns),
+            "of calm": "" if ratio is None else round(ratio, 2),
+            "counters": " ".join(f"{k}={_number(v)}" for k, v in seen.counters.items()),
+        }
+
+    def _time(self, case: Case, preset: str, seen: Picture) -> tuple[float | None, Picture]:
+        """Return the time a sample over that of the calm case; the best where it is bad."""
+        if case.calm is None or not self.timed:
+            return None, seen
+        key = (case.calm, preset)
+        calm = self.cases[case.calm]
+        if key not in self.calm:
+            self.calm[key] = min(
+                (self.render(calm, preset) for _ in range(2)), key=lambda one: one.ns
+            )
+        best = seen
+        for _ in range(2):
+            if best.ns <= MOST_TIME * self.calm[key].ns or best.seconds > 10.0:
+                break
+            best = min(best, self.render(case, preset), key=lambda one: one.ns)
+            self.calm[key] = max(self.calm[key], self.render(calm, preset), key=lambda one: one.ns)
+        if best.seconds < LEAST_SECONDS / 10.0:
+            return None, seen
+        return best.ns / self.calm[key].ns, seen
+
+    def pairs(self) -> dict[str, Any]:
+        """Return the row of all pairs of values of the settings, refused ones included."""
+        scene, refused, failures, bad, rejected = room(16), 0, [], 0, 0
+        largest = 0.0
+        rows = pairwise_rows(setting_values())
+        for values in rows:
+            try:
+                settings = Settings().with_values(values)
+            except InputError as error:
+                refused += 1
+                if "\n" in str(error):
+                    failures.append(f"{values}: refused in more than a line")
+                continue
+            try:
+                seen = picture(self.device, scene, settings, 4)
+            except (TooSlowError, DeviceError, InputError) as error:
+                failures.append(f"{values}: {error}")
+                continue
+            bad, rejected = bad + seen.bad, rejected + seen.rejected
+            largest = max(largest, seen.largest)
+        if bad or rejected:
+            failures.append(f"{bad} pixels are not finite, {rejected} samples rejected")
+        return dict.fromkeys(COLUMNS, "") | {
+            "case": PAIRS,
+            "preset": "all",
+            "verdict": "FAILED" if failures else "ok",
+            "why": "; ".join(failures),
+            "not finite": bad,
+            "rejected": rejected,
+            "largest": largest,
+            "counters": f"rows={len(rows)} refused={refused}",
+        }
+
+
+def setting_values() -> dict[str, list[Any]]:
+    """Return values of every setting: all choices; of numbers the ends of the range and between."""
+    values: dict[str, list[Any]] = {}
+    for item in dataclasses.fields(Settings):
+        if "choices" in item.metadata:
+            values[item.name] = list(item.metadata["choices"])
+        elif item.metadata.get("switch"):
+            values[item.name] = [False, True]
+        else:
+            low, high = item.metadata["range"]
+            values[item.name] = list(dict.fromkeys([item.default, low, high]))
+    return values
+
+
+def pairwise_rows(values: Mapping[str, Sequence[Any]], seed: int = 1) -> list[dict[str, Any]]:
+    """Return combinations such that any two values of two settings meet in one of them.
+
+    Greedy: of some random candidates that contain a pair still missing, the one with most of them.
+    Source: Cohen, Dalal, Fredman, Patton: The AETG System, IEEE Trans. Software Eng. 23 (7), 1997.
+    """
+    names = list(values)
+    missing = {
+        (a, i, b, j)
+        for a, b in itertools.combinations(range(len(names)), 2)
+        for i in range(len(values[names[a]]))
+        for j in range(len(values[names[b]]))
+    }
+    chance, rows = np.random.default_rng(seed), []
+    while missing:
+        best: tuple[set[tuple[int, ...]], list[int]] = (set(), [])
+        a, i, b, j = min(missing)
+        for _ in range(20):
+            pick = [int(chance.integers(len(values[name]))) for name in names]
+            pick[a], pick[b] = i, j
+            met = {
+                (x, pick[x], y, pick[y]) for x, y in itertools.combinations(range(len(names)), 2)
+            } & missing
+            best = max(best, (met, pick), key=lambda candidate: len(candidate[0]))
+        missing -= best[0]
+        rows.append({name: values[name][k] for name, k in zip(names, best[1], strict=True)})
+    return rows
+
+
+def missing_rows(rows: Sequence[Mapping[str, Any]], wanted: Sequence[tuple[str, str]]) -> list[str]:
+    """Return what a whole table would have and this one has not: cases, presets, columns."""
+    have = {(row["case"], row["preset"]) for row in rows}
+    missing = [f"{case} with {preset}" for case, preset in wanted if (case, preset) not in have]
+    return missing + sorted({c for row in rows for c in COLUMNS if c not in row})
+
+
+def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the table as CSV."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS)
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def as_html(rows: Sequence[Mapping[str, Any]], title: str) -> str:
+    """Return the table as a page that opens offline."""
+
+    def line(tag: str, cells: Sequence[Any], kind: str = "") -> str:
+        inner = "".join(f"<{tag}>{html.escape(_number(cell))}</{tag}>" for cell in cells)
+        return f"<tr{kind}>{inner}</tr>"
+
+    body = "\n".join(
+        line("td", [row[c] for c in COLUMNS], "" if row["verdict"] == "ok" else " class=failed")
+        for row in rows
+    )
+    style = (
+        "body{font:14px system-ui}table{border-collapse:collapse}td,th{padding:2px 8px;"
+        "border-bottom:1px solid #ddd;text-align:left}tr.failed{background:#fdd}"
+    )
+    return (
+        f"<!doctype html><meta charset=utf-8><title>{html.escape(title)}</title>"
+        f"<style>{style}</style><h1>{html.escape(title)}</h1><table>"
+        f"{line('th', COLUMNS)}\n{body}</table>\n"
+    )
+
+
+def show(rows: Sequence[Mapping[str, Any]]) -> None:
+    """Print the columns that matter most."""
+    table = Table(title="Stability", title_justify="left")
+    shown = ("case", "preset", "verdict", "mean", "truth", "allowed", "largest", "of calm", "why")
+    for column in shown:
+        table.add_column(column, overflow="fold")
+    for row in rows:
+        style = None if row["verdict"] == "ok" else "bold red"
+        table.add_row(*(_number(row[column]) for column in shown), style=style)
+    Console(width=None if sys.stdout.isatty() else 160, markup=False).print(table)
+
+
+def _number(value: Any) -> str:
+    return f"{value:.5g}" if isinstance(value, float) else str(value)
+
+
+def chosen(args: argparse.Namespace) -> Iterator[tuple[Case, str]]:
+    """Yield the cases and presets that were asked for."""
+    for preset in args.presets.split(","):
+        for case in CASES:
+            if args.cases in case.name:
+                yield case, preset
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Make the table; return 0 if nothing failed, 1 if something did, 2 for bad usage."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("-o", "--output", metavar="FOLDER", type=Path)
+    parser.add_argument("--presets", default=",".join(PRESETS), help="default: all")
+    parser.add_argument("--cases", default="", metavar="TEXT", help="those whose name has it")
+    parser.add_argument("--spp", type=positive_integer, default=SPP)
+    parser.add_argument("--edge", type=positive_integer, default=EDGE, help="of pictures, pixels")
+    parser.add_argument("--device", metavar="TEXT")
+    parser.add_argument("--no-times", action="store_true", help="measure no times")
+    args = parser.parse_args(argv)
+    unknown = sorted(set(args.presets.split(",")) - set(PRESETS))
+    if unknown:
+        print(f"--presets: there is no {', '.join(unknown)}", file=sys.stderr)
+        return 2
+    bench = Bench(open_device(args.device), args.edge, args.spp, not args.no_times)
+    rows = []
+    wanted = [(case.name, preset) for case, preset in chosen(args)]
+    for case, preset in chosen(args):
+        rows.append(bench.row(case, preset))
+        last = rows[-1]
+        print(f"{preset}: {case.name}: {last['verdict']} {last['why']}", file=sys.stderr)
+    if args.cases in PAIRS:
+        wanted.append((PAIRS, "all"))
+        rows.append(bench.pairs())
+    show(rows)
+    if args.output is not None:
+        args.output.mkdir(parents=True, exist_ok=True)
+        write_whole(args.output / "stability.csv", as_csv(rows).encode())
+        title = f"Stability on {bench.device.name}, {args.spp} samples a pixel"
+        write_whole(args.output / "stability.html", as_html(rows, title).encode())
+    missing = missing_rows(rows, wanted)
+    for what in missing:
+        print(f"missing: {what}", file=sys.stderr)
+    failed = sum(row["verdict"] != "ok" for row in rows)
+    print(f"{len(rows)} rows, {failed} failed, {len(missing)} missing")
+    return int(bool(failed or missing or not rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

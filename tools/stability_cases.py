@@ -1,0 +1,370 @@
+"""The cases of ``tools/stability.py``: scenes that are stiff, extreme or degenerate.
+
+A case knows its answer in one of three ways: a closed form; the picture of a calm scene that has to
+look the same; or, where settings change what is computed, only that it ends and is finite.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from psf_cl.scene import primitives, transform
+from psf_cl.scene.model import Camera, Environment, Material, Mesh, Scene, Shape
+
+#: Bounces of furnaces: enough that what is left out would show.
+LONG = 1000
+
+Part = tuple[Mesh, np.ndarray, Material]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One extreme.
+
+    Attributes:
+        scene: makes the scene; the argument is the edge of the picture.
+        truth: mean radiance of the picture, or the name of the case that looks the same.
+        calm: the case whose time a sample is compared with; None if this one asks for more rays.
+        settings: over those of the preset.
+        spp: samples a pixel, as a multiple of the usual number; or a number of their own.
+        tolerance: of the mean, if the usual one is not fit: what the model itself loses.
+        size: of the picture, if it is not to be the usual one.
+        fireflies: largest pixel at most, as a multiple of that of the picture that looks the same;
+            None if nothing is known about it.
+    """
+
+    name: str
+    scene: Callable[[int], Scene]
+    truth: float | str
+    calm: str | None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    spp: float = 1.0
+    own_spp: int = 0
+    tolerance: float = 0.0
+    size: tuple[int, int] | None = None
+    fireflies: float | None = 4.0
+
+
+def grey(value: float) -> tuple[float, float, float]:
+    """Return three times the same number."""
+    return (value, value, value)
+
+
+def matt(albedo: float, **values: Any) -> Material:
+    """Return a Lambertian material."""
+    return Material(base_color=grey(albedo), specular=0.0, **values)
+
+
+def scene_of(parts: Iterable[Part], view: Camera, edge: int, sky: float = 0.0) -> Scene:
+    """Return a square picture of ``parts`` under a grey sky."""
+    parts = list(parts)
+    return Scene(
+        "a case",
+        edge,
+        edge,
+        cameras=(view,),
+        materials=tuple(material for _, _, material in parts) or (Material(),),
+        shapes=tuple(
+            Shape(mesh.name, mesh, matrix, index) for index, (mesh, matrix, _) in enumerate(parts)
+        ),
+        environment=Environment(grey(sky)),
+    )
+
+
+def camera(
+    position: Sequence[float], target: Sequence[float], degrees: float = 45.0, **values: Any
+) -> Camera:
+    """Return a camera that looks from a position at a target."""
+    return Camera(
+        transform.look_at(position, target, (0.0, 1.0, 0.0)), float(np.radians(degrees)), **values
+    )
+
+
+# The room: matt walls, a ball, a lamp; about 350 triangles and so a tree.
+
+
+def room_parts(lamp: float = 0.5, radiance: float = 10.0) -> dict[str, Part]:
+    """Return walls of a room of 2 m around the origin, a ball and a lamp of that edge."""
+    down = transform.translation((0.0, 0.99, 0.0)) @ transform.rotation_xyz_degrees((180, 0, 0))
+    inside = primitives.box()
+    inside = dataclasses.replace(inside, triangles=inside.triangles[:, ::-1].copy(), normals=None)
+    ball = transform.translation((0.3, -0.6, 0.1)) @ transform.scaling(0.4)
+    return {
+        "walls": (inside, np.eye(4), matt(0.6)),
+        "ball": (primitives.sphere(20, 8), ball, matt(0.8)),
+        "lamp": (
+            primitives.quad(),
+            down @ transform.scaling(lamp / 2),
+            Material(base_color=grey(0.0), specular=0.0, emission=grey(radiance)),
+        ),
+    }
+
+
+ROOM_VIEW = ((0.0, 0.0, 0.95), (0.0, -0.2, -1.0), 60.0)
+
+
+def room(
+    edge: int,
+    change: Callable[[dict[str, Part]], dict[str, Part]] = lambda parts: parts,
+    scale: float = 1.0,
+    move: Sequence[float] = (0.0, 0.0, 0.0),
+    **lamp: float,
+) -> Scene:
+    """Return the room with parts changed, then scaled about the origin, then moved."""
+    place = transform.translation(move) @ transform.scaling(scale)
+    parts = change(room_parts(**lamp))
+    where, target, degrees = ROOM_VIEW
+    points = [(place @ [*point, 1.0])[:3] for point in (where, target)]
+    moved = [(mesh, place @ matrix, material) for mesh, matrix, material in parts.values()]
+    return scene_of(moved, camera(*points, degrees), edge)
+
+
+def room_case(name: str, calm: str | None = "room", **values: Any) -> Case:
+    """Return a case of the room; ``values`` are those of ``Case``, the rest of ``room``."""
+    known = {item.name for item in dataclasses.fields(Case)}
+    own = {key: values.pop(key) for key in [*values] if key in known}
+    return Case(name, lambda edge: room(edge, **values), own.pop("truth", "room"), calm, **own)
+
+
+def sliced(mesh: Mesh, cuts: int = 40) -> Mesh:
+    """Return the unit quad in strips whose widths span seven decades."""
+    widths = np.logspace(-7, 0, cuts)
+    edges = np.concatenate([[0.0], np.cumsum(widths)])
+    x = edges / edges[-1] * 2.0 - 1.0
+    low, high = mesh.positions[:, 2].min(), mesh.positions[:, 2].max()
+    points = np.array([(a, 0.0, z) for a in x for z in (low, high)], np.float32)
+    first = 2 * np.arange(cuts, dtype=np.uint32)[:, None]
+    triangles = np.concatenate([first + np.array([0, 1, 2]), first + np.array([2, 1, 3])]).astype(
+        np.uint32
+    )
+    return Mesh("slivers", points, triangles)
+
+
+def subdivided(count: int) -> Mesh:
+    """Return the unit quad, front up, in 2 * count^2 triangles."""
+    axis = np.linspace(-1.0, 1.0, count + 1, dtype=np.float32)
+    x, z = np.meshgrid(axis, axis)
+    points = np.stack([x, np.zeros_like(x), z], axis=-1).reshape(-1, 3)
+    row = np.arange(count)
+    corner = (row[:, None] * (count + 1) + row).reshape(-1, 1)
+    after = corner + count + 1
+    triangles = np.concatenate(
+        [np.hstack([corner, after, corner + 1]), np.hstack([corner + 1, after, after + 1])]
+    )
+    return Mesh("grid", points, triangles.astype(np.uint32))
+
+
+def with_floor(parts: dict[str, Part], mesh: Mesh, matrix: np.ndarray | None = None) -> None:
+    """Add a floor that lies in the plane of the room's own."""
+    at = transform.translation((0.0, -1.0, 0.0))
+    parts["floor"] = (mesh, at if matrix is None else matrix, parts["walls"][2])
+
+
+def with_slivers(parts: dict[str, Part]) -> dict[str, Part]:
+    """Cover the floor with slivers."""
+    with_floor(parts, sliced(primitives.quad()), transform.translation((0.0, -0.9999, 0.0)))
+    return parts
+
+
+def with_overlaps(parts: dict[str, Part]) -> dict[str, Part]:
+    """Lay more triangles into the plane of the floor."""
+    with_floor(parts, primitives.quad())
+    parts["more floor"] = (
+        primitives.disk(),
+        transform.translation((0.1, -1.0, 0.2)) @ transform.scaling(0.7),
+        parts["walls"][2],
+    )
+    return parts
+
+
+def with_duplicates(parts: dict[str, Part]) -> dict[str, Part]:
+    """Have all triangles but those of the lamp twice."""
+    return {**parts, "walls too": parts["walls"], "ball too": parts["ball"]}
+
+
+def with_mixed_sizes(parts: dict[str, Part]) -> dict[str, Part]:
+    """Add triangles of 1e-6 m on the floor, and a ground of 1e4 m below the room."""
+    chance = np.random.default_rng(1)
+    places = np.column_stack(
+        [chance.uniform(-0.9, 0.9, 300), np.full(300, -0.99), chance.uniform(-0.9, 0.9, 300)]
+    )
+    points = places[:, None] + 1e-6 * chance.standard_normal((300, 3, 3))
+    dust = Mesh("dust", points.reshape(-1, 3).astype(np.float32), np.arange(900).reshape(-1, 3))
+    dust = dataclasses.replace(dust, triangles=dust.triangles.astype(np.uint32))
+    ground = transform.translation((0.0, -2.0, 0.0)) @ transform.scaling(1e4)
+    return {
+        **parts,
+        "dust": (dust, np.eye(4), parts["walls"][2]),
+        "ground": (primitives.quad(), ground, parts["walls"][2]),
+    }
+
+
+def with_a_million_in_a_point(parts: dict[str, Part]) -> dict[str, Part]:
+    """Add a million triangles of the same three corners, 1e-5 m apart."""
+    corners = np.array([[0, 0, 0], [1e-5, 0, 0], [0, 1e-5, 0]], np.float32) + np.array(
+        [0.9, -0.9, -0.9]
+    )
+    triangles = np.tile(np.arange(3, dtype=np.uint32), (10**6, 1))
+    heap = Mesh("heap", corners.astype(np.float32), triangles)
+    return {**parts, "heap": (heap, np.eye(4), parts["walls"][2])}
+
+
+def with_many_lights(parts: dict[str, Part]) -> dict[str, Part]:
+    """Cut the lamp into 2^17 triangles."""
+    _, matrix, material = parts["lamp"]
+    return {**parts, "lamp": (subdivided(256), matrix, material)}
+
+
+def with_dim_light(parts: dict[str, Part]) -> dict[str, Part]:
+    """Add a lamp that is a million times darker."""
+    mesh, matrix, material = parts["lamp"]
+    dim = matt(0.6, emission=grey(1e-6 * material.emission[0]))
+    shifted = transform.translation((0.6, -0.001, 0.0)) @ matrix
+    return {**parts, "dim lamp": (mesh, shifted, dim)}
+
+
+def without_light(parts: dict[str, Part]) -> dict[str, Part]:
+    """Take the lamp away."""
+    return {name: part for name, part in parts.items() if name != "lamp"}
+
+
+# Furnaces: a closed room of one albedo whose walls glow such that all of it has the radiance 1.
+
+
+def furnace(
+    edge: int,
+    albedo: float = 0.5,
+    depth: int = LONG,
+    view: tuple[Any, ...] = ROOM_VIEW,
+    scale: float = 1.0,
+) -> Scene:
+    """Return a furnace; paths of ``depth`` bounces bring 1 exactly."""
+    bounces = sum(albedo**k for k in range(depth + 1))
+    inside, matrix, _ = room_parts()["walls"]
+    glowing = matt(albedo, emission=grey(1.0 / bounces))
+    where, target, degrees = view
+    eye = camera(scale * np.asarray(where), scale * np.asarray(target), degrees)
+    return scene_of([(inside, transform.scaling(scale) @ matrix, glowing)], eye, edge)
+
+
+def furnace_case(name: str, calm: str | None = "furnace", **values: Any) -> Case:
+    """Return a case of a furnace; ``values`` are those of ``Case``, the rest of ``furnace``."""
+    known = {item.name for item in dataclasses.fields(Case)}
+    own = {key: values.pop(key) for key in [*values] if key in known}
+    depth = values.setdefault("depth", LONG)
+    own["settings"] = {"max_depth": depth} | dict(own.get("settings", {}))
+    return Case(name, lambda edge: furnace(edge, **values), 1.0, calm, **own)
+
+
+# A white world: what takes no light away is not to be seen before a sky of radiance 1.
+
+
+def white_world(edge: int, parts: Sequence[Part], view: Camera | None = None) -> Scene:
+    """Return ``parts`` before a sky of radiance 1."""
+    return scene_of(parts, view or camera((0.0, 0.3, 3.0), (0.0, 0.0, 0.0), 45.0), edge, sky=1.0)
+
+
+def ball_case(name: str, material: Material, calm: str | None, **values: Any) -> Case:
+    """Return a case of a ball in the white world, or of balls in each other (``radii``)."""
+    known = {item.name for item in dataclasses.fields(Case)}
+    own = {key: values.pop(key) for key in [*values] if key in known}
+    own["settings"] = {"max_depth": LONG} | dict(own.get("settings", {}))
+    radii = values.pop("radii", (1.0,))
+    # Flat: shading normals alone let light get lost.
+    mesh = dataclasses.replace(primitives.sphere(48, 24), normals=None)
+    parts = [(mesh, transform.scaling(radius), material) for radius in radii]
+    return Case(
+        name, lambda edge: white_world(edge, parts, **values), own.pop("truth", 1.0), calm, **own
+    )
+
+
+def glass(ior: float = 1.5, roughness: float = 0.0) -> Material:
+    """Return glass that takes no light away."""
+    return Material(base_color=grey(1.0), transmission=1.0, ior=ior, roughness=roughness)
+
+
+def metal(roughness: float) -> Material:
+    """Return a metal that takes no light away."""
+    return Material(base_color=grey(1.0), metallic=1.0, roughness=roughness)
+
+
+def grazing(material: Material) -> Callable[[int], Scene]:
+    """Return a plane that is seen at 89.9 degrees."""
+    height = 100.0 * np.sin(np.radians(0.1))
+    eye = camera((0.0, height, 100.0), (0.0, 0.0, 0.0), 0.02)
+    parts = [(primitives.quad(), transform.scaling(1e4), material)]
+    return lambda edge: white_world(edge, parts, eye)
+
+
+def tiny_light(edge: float, radiance: float) -> Callable[[int], Scene]:
+    """Return the floor below a lamp of ``edge`` m; the camera does not see the lamp."""
+    parts = room_parts(edge, radiance)
+    eye = camera((0.0, 0.9, 0.9), (0.0, -1.0, 0.0), 40.0)
+    return lambda size: scene_of(parts.values(), eye, size)
+
+
+CASES: tuple[Case, ...] = (
+    room_case("room", truth="room"),
+    *(room_case(f"scaled by {scale:g}", scale=scale) for scale in (1e-6, 1e-4, 1e-2, 1e2, 1e5)),
+    *(room_case(f"moved by {by:g}", move=(by, -by, 0.7 * by)) for by in (1e3, 1e4, 1e5, 1e6)),
+    room_case("1e-6 and 1e4 m together", change=with_mixed_sizes),
+    room_case("slivers", change=with_slivers),
+    room_case("duplicates", change=with_duplicates),
+    room_case("coplanar overlaps", change=with_overlaps),
+    room_case("a million triangles in a point", change=with_a_million_in_a_point),
+    room_case("2^17 lights", change=with_many_lights),
+    room_case("lights 1e6 : 1", change=with_dim_light),
+    Case("no light", lambda edge: room(edge, without_light), 0.0, "room"),
+    room_case("radiance 1e-12", radiance=1e-12, truth="room * 1e-13"),
+    room_case("radiance 1e12", radiance=1e12, truth="room * 1e11"),
+    Case("small light", tiny_light(2e-2, 2.5e3), "small light", "small light"),
+    Case("light of 1e-4 m at 1e8", tiny_light(1e-4, 1e8), "small light", "small light"),
+    furnace_case("furnace"),
+    furnace_case("furnace of albedo 0.99", None, albedo=0.99, fireflies=None),
+    furnace_case("furnace of albedo 0.999", None, albedo=0.999, fireflies=None),
+    furnace_case("furnace of albedo 1", None, albedo=1.0, fireflies=None),
+    furnace_case(
+        "furnace of albedo 1 without roulette",
+        None,
+        albedo=1.0,
+        settings={"termination": "off"},
+        spp=0.25,
+    ),
+    furnace_case("furnace of 1e-6 m", scale=1e-6),
+    furnace_case("depth 0", depth=0),
+    furnace_case("depth 1", depth=1),
+    furnace_case("camera on a wall", view=((0.2, -1.0, 0.3), (0.0, 0.0, -1.0), 60.0)),
+    furnace_case("camera in a corner", view=((-1.0, -1.0, -1.0), (0.0, 0.0, 0.0), 60.0)),
+    furnace_case("field of view 0.1", view=(*ROOM_VIEW[:2], 0.1)),
+    furnace_case("field of view 179", view=(*ROOM_VIEW[:2], 179.0)),
+    furnace_case("1x1 pixel", None, depth=3, size=(1, 1), spp=16),
+    furnace_case("8192x64 pixels", depth=3, size=(8192, 64), spp=0.05),
+    furnace_case("1e6 samples of a pixel", None, depth=1, size=(1, 1), own_spp=10**6),
+    furnace_case("tiny cells", None, depth=3, settings={"cell_size": 1e-3}),
+    furnace_case("huge cells", None, depth=3, settings={"cell_size": 1e6}),
+    furnace_case(
+        "a cell a sample, a table full", None, depth=3, size=(64, 64), settings={"cell_size": 1e-3}
+    ),
+    furnace_case("a table of one slot", None, depth=3, size=(1, 1), spp=16),
+    # Weights of long ways along the facets of a ball multiply.
+    ball_case("glass", glass(), "glass", fireflies=None),
+    ball_case("glass of index 1", glass(1.0), "glass"),
+    ball_case("glass of index 1.0001", glass(1.0001), "glass"),
+    ball_case("glass of index 5", glass(5.0), None, fireflies=None),
+    ball_case("glass of roughness 1e-4", glass(1.5, 1e-4), "glass", fireflies=None),
+    ball_case("nested glass", glass(), None, radii=(1.0, 0.7, 0.4), fireflies=None),
+    ball_case("metal", metal(0.3), "metal", tolerance=0.01),
+    ball_case("metal of roughness 0", metal(0.0), "metal"),
+    ball_case("metal of roughness 1e-4", metal(1e-4), "metal"),
+    ball_case("metal of roughness 1", metal(1.0), "metal", tolerance=0.02),
+    Case("plane at 89.9 degrees", grazing(matt(1.0)), 1.0, None),
+    Case("metal at 89.9 degrees", grazing(metal(0.3)), 1.0, None, tolerance=0.02),
+    ball_case("alpha 1", matt(0.0, alpha=1.0, alpha_mode="blend"), None, truth="black ball"),
+    ball_case("black ball", matt(0.0), None, truth="black ball"),
+    ball_case("alpha 0", matt(0.0, alpha=0.0, alpha_mode="blend"), None),
+)
