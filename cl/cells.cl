@@ -9,131 +9,196 @@
 #include "common/lanes.h"
 #include "common/layout.h"
 #include "common/passes.h"
-#include "common/pixels.h"
 #include "common/cells.h"
 #include "common/hash_map.h"
 
-/// W samples of a pass, as the cells see them.
+/// Where in the rings a pass is.
 typedef struct {
-    Mask there;       // it has a vertex, and what it gathered behind it can be summed
-    Mask rejected;    // it has a vertex, but what it gathered is too large, or not a number
-    UInt pixel;       // place in the order of pixels
-    Vec3 beyond;      // radiance at the camera
-    Vec3 gate;        // what became of light on its way from the vertex to the camera
-    CellQuery query;
-} CellSamples;
+    uint pass;
+    ulong samples;    // first sample
+    ulong slots;      // first slot of its table
+    ulong buckets;    // first bucket
+    float width;      // edge of a cell, m per m of the path
+} PassPlace;
 
-static inline CellSamples load_cell_samples(
-    __global const Params *params,
-    __global const Beyond *beyond,
-    __global const CellVertex *vertices,
-    uint first,
-    uint pass)
+static inline PassPlace place_of(__global const Params *params, uint pass)
 {
-    const ulong base = (ulong)(pass & (params->ring - 1u)) * params->pixel_count;
-    beyond += base;
-    vertices += base;
-    const UInt wanted = lanes_before(MASK_ALL) + first;
-    const Mask inside = wanted < params->pixel_count;
-    CellSamples s;
-    s.pixel = pick_u(inside, wanted, (UInt)(0u));
-    s.beyond = vec3(GATHER(beyond, s.pixel, radiance[0]), GATHER(beyond, s.pixel, radiance[1]),
-                    GATHER(beyond, s.pixel, radiance[2]));
-    const UInt vertex = GATHER_U(beyond, s.pixel, vertex);
-    s.gate = vec3(GATHER(vertices, s.pixel, gate[0]), GATHER(vertices, s.pixel, gate[1]),
-                  GATHER(vertices, s.pixel, gate[2]));
-    s.query.p = vec3(GATHER(vertices, s.pixel, p[0]), GATHER(vertices, s.pixel, p[1]),
-                     GATHER(vertices, s.pixel, p[2]));
-    s.query.ng = unpack_unit(GATHER_U(vertices, s.pixel, ng));
-    s.query.seen = (vertex & VERTEX_MASK) == 1u;
-    s.query.near = params->cell_flags & CELL_NEAR ? vertex >> 31 : (UInt)(0u);
-    s.query.extra = params->cell_flags & CELL_IDENTITY ? s.pixel + 1u : (UInt)(0u);
-    const float shrunk = params->cell_width * exp2(params->cell_shrink * log2((float)(pass - params->first_pass + 1u)));
-    s.query.width = GATHER(vertices, s.pixel, length) * shrunk;
-    s.there = inside & (vertex != 0u);
-
-    const Vec3 light = demodulated(s.beyond, s.gate);
-    const UInt largest = max(as_bits(light.x), max(as_bits(light.y), as_bits(light.z)));
-    s.rejected = s.there & (largest >= as_uint(params->cell_limit));
-    s.there &= !s.rejected;
-    return s;
+    const ulong at = pass & (params->ring - 1u);
+    PassPlace place;
+    place.pass = pass;
+    place.samples = at * params->pixel_count;
+    place.slots = at * params->cell_slots;
+    place.buckets = place.slots / bucket_size(params->cell_slots);
+    place.width = params->cell_width * exp2(params->cell_shrink * log2((float)(pass - params->first_pass + 1u)));
+    return place;
 }
 
-/// Random bits of the samples for one purpose.
-static inline void cell_random(
-    __global const Params *params, UInt pixel, uint pass, uint pair, UInt *a, UInt *b)
+/// What the cells are asked for by the samples of the lanes in `mask`; `pixel` is in the order of pixels.
+static inline CellQuery load_query(
+    __global const Params *params, __global const CellVertex *vertices, UInt pixel, UInt vertex, float width)
 {
-    UInt x;
-    UInt y;
-    pixel_place(params, pixel, &x, &y);
-    const UInt seed = pixel_seed(y * params->width + x, params->seed);
-    sample_bits(seed, reverse_bits((UInt)(pass)), (UInt)(pair), params->sampler, a, b);
+    CellQuery query;
+    query.p = vec3(GATHER(vertices, pixel, p[0]), GATHER(vertices, pixel, p[1]), GATHER(vertices, pixel, p[2]));
+    query.ng = unpack_direction(GATHER_U(vertices, pixel, ng));
+    query.seen = (vertex & VERTEX_MASK) == 1u;
+    query.near = params->cell_flags & CELL_NEAR ? vertex >> 31 : (UInt)(0u);
+    query.extra = params->cell_flags & CELL_IDENTITY ? pixel + 1u : (UInt)(0u);
+    query.width = GATHER(vertices, pixel, length) * width;
+    return query;
+}
+
+static inline Vec3 load_gate(__global const CellVertex *vertices, UInt pixel)
+{
+    return vec3(GATHER(vertices, pixel, gate[0]), GATHER(vertices, pixel, gate[1]), GATHER(vertices, pixel, gate[2]));
+}
+
+static inline Vec3 load_beyond(__global const Beyond *beyond, UInt pixel)
+{
+    return vec3(GATHER(beyond, pixel, radiance[0]), GATHER(beyond, pixel, radiance[1]),
+                GATHER(beyond, pixel, radiance[2]));
+}
+
+/// Cell that samples are stored in.  Neighbours are moved alike: most of a tile meets in one cell, and is
+/// added to it at once.
+static inline CellKey cell_to_store(__global const Params *params, const CellQuery *query, UInt pixel, uint pass)
+{
+    UInt a;
+    UInt b;
+    cell_random(params, pixel / CELL_TILE, pass, CELL_STORE, &a, &b);
+    return cell_of(params, query, a, b);
+}
+
+/// Cell whose average samples use.
+static inline CellKey cell_to_look_up(__global const Params *params, const CellQuery *query, UInt pixel, uint pass)
+{
+    UInt a;
+    UInt b;
+    cell_random(params, pixel, pass, CELL_LOOK_UP, &a, &b);
+    return cell_of(params, query, a, b);
+}
+
+/// Add what W samples gathered behind their vertices to cells.
+static inline void store_samples(
+    __global const Params *params,
+    __global Beyond *beyond,
+    __global const CellVertex *vertices,
+    volatile __global uint *counters,
+    volatile __global uint *keys,
+    volatile __global Cell *cells,
+    __global uint *full_buckets,
+    uint first,
+    const PassPlace *place)
+{
+    const UInt wanted = lanes_before(MASK_ALL) + first;
+    const Mask inside = wanted < params->pixel_count;
+    const UInt pixel = pick_u(inside, wanted, (UInt)(0u));
+    const UInt vertex = GATHER_U(beyond, pixel, vertex);
+    const Vec3 light = demodulated(load_beyond(beyond, pixel), load_gate(vertices, pixel));
+    const UInt largest = max(as_bits(light.x), max(as_bits(light.y), as_bits(light.z)));
+    Mask there = inside & (vertex != 0u);
+    const Mask rejected = there & (largest >= as_uint(params->cell_limit));
+    if (any_lane(rejected)) {
+        count_up(&counters[COUNTER_REJECTED_CELLS], count_lanes(rejected));
+        for (uint left = lane_bits(rejected); left; left &= left - 1u)
+            beyond[first + lowest_bit(left)].vertex |= VERTEX_REJECTED;
+        there &= !rejected;
+    }
+    if (!any_lane(there))
+        return;
+    const CellQuery query = load_query(params, vertices, pixel, vertex, place->width);
+    const CellKey key = cell_to_store(params, &query, pixel, place->pass);
+
+    const Float value[3] = {light.x, light.y, light.z};
+    uint lane_low[3][W];
+    uint lane_high[3][W];
+    UInt random = mix_bits(pixel * 0x9e3779b9u + place->pass);
+    for (uint c = 0; c < 3; ++c) {
+        UInt low;
+        UInt high;
+        to_fixed(value[c], (Float)(params->cell_steps), unit_float(random), &low, &high);
+        store_lanes_u(low, lane_low[c]);
+        store_lanes_u(high, lane_high[c]);
+        random = mix_bits(random + 0x9e3779b9u);
+    }
+    uint lane_bucket[W];
+    uint lane_key[W];
+    store_lanes_u(key.bucket, lane_bucket);
+    store_lanes_u(key.key, lane_key);
+    const uint size = bucket_size(params->cell_slots);
+    uint failed = 0;
+    for (uint left = lane_bits(there); left;) {
+        const uint i = lowest_bit(left);
+        const uint same = left & lane_bits((key.bucket == lane_bucket[i]) & (key.key == lane_key[i]));
+        left &= ~same;
+        const uint slot = find_or_insert(keys, lane_bucket[i], size, lane_key[i]);
+        if (slot == NO_SLOT) {
+            full_buckets[lane_bucket[i] / size] = 1u;
+            failed += popcount(same);
+        } else {
+            add_lanes(&cells[slot], same, lane_low, lane_high);
+        }
+    }
+    if (failed != 0u)
+        count_up(&counters[COUNTER_FAILED_INSERTS], failed);
 }
 
 /// Add what the samples of every complete pass gathered behind their vertices to cells.  One work item W
-/// pixels, after the passes are complete and before look_up_cells.
+/// pixels, RUN times, after the passes are complete and before resolve_cells.
 ///
 /// A sample whose bucket is full marks it: nobody uses the bucket.  One that is too large for the sums is
-/// left out.  Both are counted.
+/// left out, and marked.  Both are counted.
 ///
 /// reads   beyond, vertices, counters
-/// writes  cell_keys, cells, full_buckets, counters.{failed_inserts, rejected_cells} (atomic)
+/// writes  cell_keys, cells, full_buckets, beyond.vertex, counters.{failed_inserts, rejected_cells} (atomic)
 kernel void store_cells(
     __global const Params *params,
-    __global const Beyond *beyond,
+    __global Beyond *beyond,
     __global const CellVertex *vertices,
     volatile __global uint *counters,
     volatile __global uint *cell_keys,
     volatile __global Cell *cells,
     __global uint *full_buckets)
 {
-    const uint first = get_global_id(0) * W;
-    if (first >= params->pixel_count)
+    const uint first = get_global_id(0) * (W * RUN);
+    const uint end = min(first + W * RUN, params->pixel_count);
+    const uint passes = first < end ? complete_passes(params, counters) : 0u;
+    for (uint k = 0; k < passes; ++k) {
+        const PassPlace place = place_of(params, counters[COUNTER_FILM_PASS] + k);
+        for (uint i = first; i < end; i += W)
+            store_samples(params, beyond + place.samples, vertices + place.samples, counters,
+                          cell_keys + place.slots, cells + place.slots, full_buckets + place.buckets, i, &place);
+    }
+}
+
+/// Turn the sums of the cells of every complete pass into averages.  One work item a bucket, between
+/// store_cells and look_up_cells.
+///
+/// reads   cell_keys, counters
+/// writes  cells
+kernel void resolve_cells(
+    __global const Params *params,
+    const volatile __global uint *counters,
+    __global const uint *cell_keys,
+    __global Cell *cells)
+{
+    const uint size = bucket_size(params->cell_slots);
+    const uint bucket = get_global_id(0);
+    if (bucket >= params->cell_slots / max(size, 1u))
         return;
     const uint passes = complete_passes(params, counters);
     for (uint k = 0; k < passes; ++k) {
-        const uint pass = counters[COUNTER_FILM_PASS] + k;
-        const CellSamples s = load_cell_samples(params, beyond, vertices, first, pass);
-        if (any_lane(s.rejected))
-            atomic_add(&counters[COUNTER_REJECTED_CELLS], count_lanes(s.rejected));
-        if (!any_lane(s.there))
+        const PassPlace place = place_of(params, counters[COUNTER_FILM_PASS] + k);
+        const ulong at = place.slots + bucket * size;
+        if (bucket_is_empty(cell_keys + at, size))
             continue;
-        UInt a;
-        UInt b;
-        cell_random(params, s.pixel, pass, PAIR_CELL_STORE, &a, &b);
-        const CellKey key = cell_of(params, s.query, a, b);
-        const Vec3 light = demodulated(s.beyond, s.gate);
-        const Float value[3] = {light.x, light.y, light.z};
-        UInt low[3];
-        UInt high[3];
-        UInt random = mix_bits(a + rotate(b, (UInt)(11u)));
-        for (uint c = 0; c < 3; ++c) {
-            to_fixed(value[c], (Float)(params->cell_steps), unit_float(random), &low[c], &high[c]);
-            random = mix_bits(random + 0x9e3779b9u);
+        for (uint i = 0; i < size; ++i) {
+            if (cell_keys[at + i] == 0u)
+                continue;
+            __global Cell *cell = &cells[at + i];
+            const float inverse = 1.0f / (params->cell_steps * (float)cell->count);
+            for (uint c = 0; c < 3; ++c)
+                cell->low[c] = as_uint(((float)cell->high[c] * 0x1p32f + (float)cell->low[c]) * inverse);
         }
-        uint lane_bucket[W];
-        uint lane_key[W];
-        store_lanes_u(key.bucket, lane_bucket);
-        store_lanes_u(key.key, lane_key);
-        const uint slots = params->cell_slots;
-        const uint size = bucket_size(slots);
-        const uint table = pass & (params->ring - 1u);
-        volatile __global uint *keys = cell_keys + (ulong)table * slots;
-        volatile __global Cell *sums = cells + (ulong)table * slots;
-        uint lane_slot[W];
-        store_lanes_u((UInt)(NO_SLOT), lane_slot);
-        for (uint left = lane_bits(s.there); left; left &= left - 1u) {
-            const uint i = lowest_bit(left);
-            lane_slot[i] = find_or_insert(keys, lane_bucket[i], size, lane_key[i]);
-            if (lane_slot[i] == NO_SLOT)
-                full_buckets[(ulong)table * (slots / size) + lane_bucket[i] / size] = 1u;
-        }
-        const UInt slot = load_lanes_u(lane_slot);
-        const Mask stored = slot != NO_SLOT;
-        const uint failed = count_lanes(s.there & !stored);
-        if (failed != 0u)
-            atomic_add(&counters[COUNTER_FAILED_INSERTS], failed);
-        add_lanes(sums, stored, slot, low, high);
     }
 }
 
@@ -149,8 +214,66 @@ static inline float4 base_share_of(__global const Beyond *beyond, __global const
 }
 #endif
 
+/// Add the light from behind the vertices to W samples.
+static inline void look_up_samples(
+    __global const Params *params,
+    __global const Beyond *beyond,
+    __global const CellVertex *vertices,
+    volatile __global uint *counters,
+    __global const uint *keys,
+    __global const Cell *cells,
+    __global const uint *full_buckets,
+#if BASE
+    __global const Seen *seen,
+    __global float *base,
+#endif
+    __global float *samples,
+    uint first,
+    const PassPlace *place)
+{
+    const UInt inside = lanes_before(MASK_ALL) + first;
+    const UInt pixel = pick_u(inside < params->pixel_count, inside, (UInt)(0u));
+    const UInt vertex = GATHER_U(beyond, pixel, vertex);
+    const Mask wanted = (inside < params->pixel_count) & (vertex != 0u);
+    if (!any_lane(wanted))
+        return;
+    const Mask there = wanted & ((vertex & VERTEX_REJECTED) == 0u);
+    const CellQuery query = load_query(params, vertices, pixel, vertex, place->width);
+    const uint size = bucket_size(params->cell_slots);
+    CellKey key = cell_to_look_up(params, &query, pixel, place->pass);
+    UInt slot = find_lanes(keys, full_buckets, there, key.bucket, size, key.key);
+    const Mask empty = there & (slot == NO_SLOT);
+    if (any_lane(empty)) {
+        // Nothing was stored there: the cell that the sample itself went to.
+        key = cell_to_store(params, &query, pixel, place->pass);
+        slot = pick_u(empty, find_lanes(keys, full_buckets, empty, key.bucket, size, key.key), slot);
+    }
+    const Mask found = slot != NO_SLOT;
+    const UInt at = pick_u(found, slot, (UInt)(0u));
+    const Vec3 mean = vec3(from_bits(GATHER_U(cells, at, low[0])), from_bits(GATHER_U(cells, at, low[1])),
+                           from_bits(GATHER_U(cells, at, low[2])));
+    Vec3 light = mul(load_gate(vertices, pixel), mean);
+    const Mask alone = wanted & !found;
+    if (any_lane(alone)) {
+        light = pick_v(alone, load_beyond(beyond, pixel), light);
+        count_up(&counters[COUNTER_UNFILTERED_SAMPLES], count_lanes(alone));
+    }
+    float lane_light[3][W];
+    store_lanes(light.x, lane_light[0]);
+    store_lanes(light.y, lane_light[1]);
+    store_lanes(light.z, lane_light[2]);
+    for (uint left = lane_bits(wanted); left; left &= left - 1u) {
+        const uint i = lowest_bit(left);
+        const float4 more = (float4)(lane_light[0][i], lane_light[1][i], lane_light[2][i], 0.0f);
+        vstore4(vload4(first + i, samples) + more, first + i, samples);
+#if BASE
+        vstore4(vload4(first + i, base) + more * base_share_of(beyond, seen, first + i), first + i, base);
+#endif
+    }
+}
+
 /// Add the light from behind the vertices to the samples of every complete pass: the average of the cell,
-/// or the sample's own where there is none.  One work item W pixels, after store_cells.
+/// or the sample's own where there is none.  One work item W pixels, RUN times, after resolve_cells.
 ///
 /// reads   beyond, vertices, cell_keys, cells, full_buckets, seen
 /// writes  samples, base; counters.unfiltered_samples (atomic)
@@ -168,61 +291,18 @@ kernel void look_up_cells(
 #endif
     __global float *samples)
 {
-    const uint first = get_global_id(0) * W;
-    if (first >= params->pixel_count)
-        return;
-    const uint passes = complete_passes(params, counters);
+    const uint first = get_global_id(0) * (W * RUN);
+    const uint end = min(first + W * RUN, params->pixel_count);
+    const uint passes = first < end ? complete_passes(params, counters) : 0u;
     for (uint k = 0; k < passes; ++k) {
-        const uint pass = counters[COUNTER_FILM_PASS] + k;
-        const CellSamples s = load_cell_samples(params, beyond, vertices, first, pass);
-        const Mask wanted = s.there | s.rejected;
-        if (!any_lane(wanted))
-            continue;
-        UInt a;
-        UInt b;
-        cell_random(params, s.pixel, pass, PAIR_CELL_LOOK_UP, &a, &b);
-        const CellKey key = cell_of(params, s.query, a, b);
-        uint lane_bucket[W];
-        uint lane_key[W];
-        uint lane_slot[W];
-        store_lanes_u(key.bucket, lane_bucket);
-        store_lanes_u(key.key, lane_key);
-        store_lanes_u((UInt)(NO_SLOT), lane_slot);
-        const uint slots = params->cell_slots;
-        const uint size = bucket_size(slots);
-        const uint table = pass & (params->ring - 1u);
-        __global const uint *keys = cell_keys + (ulong)table * slots;
-        __global const Cell *sums = cells + (ulong)table * slots;
-        for (uint left = lane_bits(s.there); left; left &= left - 1u) {
-            const uint i = lowest_bit(left);
-            if (!full_buckets[(ulong)table * (slots / size) + lane_bucket[i] / size])
-                lane_slot[i] = find(keys, lane_bucket[i], size, lane_key[i]);
-        }
-        const UInt slot = load_lanes_u(lane_slot);
-        const Mask found = slot != NO_SLOT;
-        const UInt at = pick_u(found, slot, (UInt)(0u));
-        const Float count = to_float(max(GATHER_U(sums, at, count), 1u));
-        const Float inverse = 1.0f / (params->cell_steps * count);
-        const Vec3 mean = vec3(from_fixed(GATHER_U(sums, at, low[0]), GATHER_U(sums, at, high[0])) * inverse,
-                               from_fixed(GATHER_U(sums, at, low[1]), GATHER_U(sums, at, high[1])) * inverse,
-                               from_fixed(GATHER_U(sums, at, low[2]), GATHER_U(sums, at, high[2])) * inverse);
-        const Vec3 light = pick_v(found, mul(s.gate, mean), s.beyond);
-        const Mask alone = wanted & !found;
-        if (any_lane(alone))
-            atomic_add(&counters[COUNTER_UNFILTERED_SAMPLES], count_lanes(alone));
-        float lane_light[3][W];
-        store_lanes(light.x, lane_light[0]);
-        store_lanes(light.y, lane_light[1]);
-        store_lanes(light.z, lane_light[2]);
-        const ulong at_first = (ulong)table * params->pixel_count + first;
-        for (uint left = lane_bits(wanted); left; left &= left - 1u) {
-            const uint i = lowest_bit(left);
-            const float4 more = (float4)(lane_light[0][i], lane_light[1][i], lane_light[2][i], 0.0f);
-            vstore4(vload4(at_first + i, samples) + more, at_first + i, samples);
+        const PassPlace place = place_of(params, counters[COUNTER_FILM_PASS] + k);
+        for (uint i = first; i < end; i += W)
+            look_up_samples(params, beyond + place.samples, vertices + place.samples, counters,
+                            cell_keys + place.slots, cells + place.slots, full_buckets + place.buckets,
 #if BASE
-            vstore4(vload4(at_first + i, base) + more * base_share_of(beyond, seen, at_first + i), at_first + i, base);
+                            seen + place.samples, base + 4 * place.samples,
 #endif
-        }
+                            samples + 4 * place.samples, i, &place);
     }
 }
 
@@ -237,17 +317,18 @@ kernel void clear_cells(
     __global Cell *cells,
     __global uint *full_buckets)
 {
-    const uint slots = params->cell_slots;
-    const uint size = bucket_size(slots);
+    const uint size = bucket_size(params->cell_slots);
     const uint bucket = get_global_id(0);
-    if (slots == 0u || bucket >= slots / size)
+    if (bucket >= params->cell_slots / max(size, 1u))
         return;
     const uint passes = complete_passes(params, counters);
     uint used = 0;
     uint probes = 0;
     for (uint k = 0; k < passes; ++k) {
-        const uint table = (counters[COUNTER_FILM_PASS] + k) & (params->ring - 1u);
-        const ulong at = (ulong)table * slots + bucket * size;
+        const PassPlace place = place_of(params, counters[COUNTER_FILM_PASS] + k);
+        const ulong at = place.slots + bucket * size;
+        if (bucket_is_empty(cell_keys + at, size))
+            continue;
         for (uint i = 0; i < size; ++i) {
             const uint key = cell_keys[at + i];
             if (key == 0u)
@@ -257,7 +338,7 @@ kernel void clear_cells(
             cell_keys[at + i] = 0u;
             vstore8((uint8)(0u), at + i, (__global uint *)cells);
         }
-        full_buckets[(ulong)table * (slots / size) + bucket] = 0u;
+        full_buckets[place.buckets + bucket] = 0u;
     }
     if (used != 0u) {
         add_fixed(&counters[COUNTER_CELLS_USED], &counters[COUNTER_CELLS_USED_HIGH], used, 0u);

@@ -165,7 +165,9 @@ class Renderer:
             launch(items)
 
     def _film(self) -> None:
-        for launch in (*self.cell_launches, *self.splat_launches):
+        for launch, items in self.cell_launches:
+            launch(items, film.GROUP)
+        for launch in self.splat_launches:
             launch(self._film_items(1), film.GROUP)
         for launch, planes in self.film_launches:
             launch(self._film_items(planes), film.GROUP)
@@ -532,7 +534,7 @@ class Renderer:
         names = ("failed_inserts", "rejected_cells", "unfiltered_samples")
         used, passes = whole("cells_used"), max(self.scheduler.passes, 1)
         slots = cells.slots_of(self.plan.pixel_count)
-        return {name: int(counters[layout.COUNTER_INDEX[name]]) for name in names} | {
+        return {name: whole(name) for name in names} | {
             "cells_per_pass": used / passes,
             "load": used / passes / slots,
             "mean_probes": whole("cell_probes") / max(used, 1),
@@ -760,15 +762,23 @@ class Renderer:
         ]
 
     def _bind_cells(self, program: Program | None) -> None:
-        self.cell_launches: list[Launch] = []
+        self.cell_launches: list[tuple[Launch, int]] = []
         self.add_unfiltered = self.clear_cells = None
         if program is None:
             return
-        self.cell_launches, self.clear_cells, self.add_unfiltered = (
-            [program.bind_planned(name, self.buffers) for name in ("store_cells", "look_up_cells")],
-            program.bind_planned("clear_cells", self.buffers),
-            program.bind_planned("add_unfiltered", self.buffers),
-        )
+        traits, pixels = self.plan.traits, self.plan.pixel_count
+        per_pixel = -(-pixels // (traits.lanes * traits.run))
+        per_bucket = cells.buckets(pixels)
+        self.cell_launches = [
+            (program.bind_planned(name, self.buffers), items)
+            for name, items in (
+                ("store_cells", per_pixel),
+                ("resolve_cells", per_bucket),
+                ("look_up_cells", per_pixel),
+            )
+        ]
+        self.clear_cells = program.bind_planned("clear_cells", self.buffers)
+        self.add_unfiltered = program.bind_planned("add_unfiltered", self.buffers)
 
     def _bind_chains(self, program: Program | None) -> None:
         self.splat_launches: list[Launch] = []

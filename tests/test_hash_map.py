@@ -193,15 +193,19 @@ def test_keys_are_found_again_and_others_are_not(lane_device):
         steps=1.0,
     )
     absent = np.arange(5000, 13192, dtype=np.uint32)
-    (found,) = planes.run(
-        lane_device, FILE, "find_keys", {"key": key}, outputs, keys=keys, slots=slots
-    )
-    (missed,) = planes.run(
-        lane_device, FILE, "find_keys", {"key": absent}, outputs, keys=keys, slots=slots
-    )
+    buckets = hash_map.buckets_of(slots)
+    full = lane_device.allocate("full", np.uint32, buckets)
+    state = {"keys": keys, "full": full, "slots": slots}
+    (found,) = planes.run(lane_device, FILE, "find_keys", {"key": key}, outputs, **state)
+    (missed,) = planes.run(lane_device, FILE, "find_keys", {"key": absent}, outputs, **state)
+    marks = (np.arange(buckets) % 2).astype(np.uint32)
+    lane_device.write(full, marks)
+    (usable,) = planes.run(lane_device, FILE, "find_keys", {"key": key}, outputs, **state)
+    lane_device.release(full)
     lane_device.release(keys, cells)
     np.testing.assert_array_equal(found, slot)
     assert (missed == NO_SLOT).all()
+    np.testing.assert_array_equal(usable, np.where(marks[slot // 64], NO_SLOT, slot))
 
 
 def test_fixed_point_numbers_are_exact_where_they_can_be(lane_device):

@@ -10,7 +10,7 @@
 /// What a cell is asked for, per lane.
 typedef struct {
     Vec3 p;
-    Vec3 ng;
+    Vec3 ng;          // geometric normal, of any length
     Float width;      // wanted edge of the cell, m
     Mask seen;        // the camera sees the point: the edge follows its distance
     UInt near;        // 1: its light comes from near
@@ -23,17 +23,22 @@ typedef struct {
     UInt key;
 } CellKey;
 
-/// Side of the cube that a unit vector points to: axis and sign, 0 to 5.
-static inline UInt cube_face(Vec3 n)
+// Purposes of random numbers.
+#define CELL_STORE 0u
+#define CELL_LOOK_UP 0x9e3779b9u
+
+// Pixels, one after the other in their order, that are moved alike before they are stored.
+#define CELL_TILE 16u
+
+/// Random bits for one purpose: `key` has a sequence of its own over the passes, which fills the square
+/// evenly.
+///
+/// Roberts: The Unreasonable Effectiveness of Quasirandom Sequences, 2018 (R2).
+static inline void cell_random(__global const Params *params, UInt key, uint pass, uint purpose, UInt *a, UInt *b)
 {
-    const Float ax = fabs(n.x);
-    const Float ay = fabs(n.y);
-    const Float az = fabs(n.z);
-    const Mask on_x = (ax >= ay) & (ax >= az);
-    const Mask on_y = ay >= az;
-    const UInt axis = pick_u(on_x, (UInt)(0u), pick_u(on_y, (UInt)(1u), (UInt)(2u)));
-    const Float along = pick(on_x, n.x, pick(on_y, n.y, n.z));
-    return axis * 2u + pick_u(along < 0.0f, (UInt)(1u), (UInt)(0u));
+    const UInt start = mix_bits(key + mix_bits_too((UInt)(params->seed + purpose)));
+    *a = start + pass * 0xc13fa9a9u;
+    *b = mix_bits(start) + pass * 0x91e10da6u;
 }
 
 /// Level of a cell of about `width`: the power of two below, or with the chance of the rest the one
@@ -48,51 +53,57 @@ static inline UInt cell_level(Float width, Float dither)
 /// Edge of the cells of a level.
 static inline Float cell_edge(UInt level) { return from_bits(level << 23); }
 
+/// Nearest integer as bits that count up with it; far from 0, numbers that differ keep different bits.
+static inline UInt nearest(Float x) { return as_bits(x + 0x1.8p23f); }
+
 /// Return the cell of a point that is moved in its tangent plane by up to half a cell.
 ///
-/// The level is chosen again after the move, or there would be cells of levels that no point that
-/// stays has.  Walls lie on planes of round numbers: the grid is shifted off these.  Blocks of 2 x 2 x 2
-/// cells share a bucket, for neighbours are looked up together.
-static inline CellKey cell_of(__global const Params *params, CellQuery q, UInt random_x, UInt random_y)
+/// Along the two axes of the grid that the surface faces less, the move is up to half an edge either way.
+/// The level is chosen again after it, or there would be cells of levels that no point that stays has.
+/// Walls lie on planes of round numbers: the grid is shifted off these.  Blocks of 2 x 2 x 2 cells share a
+/// bucket, for neighbours are looked up together.
+static inline CellKey cell_of(__global const Params *params, const CellQuery *q, UInt random_x, UInt random_y)
 {
     const Float dither = unit_float(mix_bits(random_x ^ rotate(random_y, (UInt)(16u))));
-    UInt level = cell_level(q.width, dither);
-    Vec3 p = q.p;
+    UInt level = cell_level(q->width, dither);
+    // The side of the cube that the normal points to: its axis w, then the two others.
+    const Vec3 n = q->ng;
+    const Float ax = fabs(n.x);
+    const Float ay = fabs(n.y);
+    const Float az = fabs(n.z);
+    const Mask on_x = (ax >= ay) & (ax >= az);
+    const Mask on_y = !on_x & (ay >= az);
+    const Mask on_z = !on_x & !on_y;
+    const Float nw = pick(on_x, n.x, pick(on_y, n.y, n.z));
+    Vec3 p = q->p;
     if (params->cell_flags & CELL_JITTER) {
         const Float edge = cell_edge(level);
-        Vec3 s;
-        Vec3 t;
-        make_frame(q.ng, &s, &t);
-        p = add_scaled(p, s, (unit_float(random_x) - 0.5f) * edge);
-        p = add_scaled(p, t, (unit_float(random_y) - 0.5f) * edge);
-        const Vec3 eye = vec3_of(params->camera_origin);
-        const Vec3 before = sub(q.p, eye);
-        const Vec3 after = sub(p, eye);
+        const Float du = (unit_float(random_x) - 0.5f) * edge;
+        const Float dv = (unit_float(random_y) - 0.5f) * edge;
+        const Float dw = -(pick(on_x, n.y, n.x) * du + pick(on_z, n.y, n.z) * dv) / nw;
+        const Vec3 move = vec3(pick(on_x, dw, du), pick(on_x, du, pick(on_y, dw, dv)), pick(on_z, dw, dv));
+        p = add(p, move);
+        const Vec3 before = sub(q->p, vec3_of(params->camera_origin));
+        const Vec3 after = add(before, move);
         const Float ratio = sqrt(dot3(after, after) / max(dot3(before, before), 1e-30f));
-        level = cell_level(pick(q.seen, q.width * ratio, q.width), dither);
+        level = cell_level(pick(q->seen, q->width * ratio, q->width), dither);
     }
     const Float inverse = 1.0f / cell_edge(level);
-    const Vec3 cell = vec3(floor(p.x * inverse + 0.37f), floor(p.y * inverse + 0.61f), floor(p.z * inverse + 0.83f));
-    const Vec3 block = vec3(floor(cell.x * 0.5f), floor(cell.y * 0.5f), floor(cell.z * 0.5f));
-    const UInt corner = to_uint(cell.x - 2.0f * block.x) + 2u * to_uint(cell.y - 2.0f * block.y)
-                        + 4u * to_uint(cell.z - 2.0f * block.z);
-    // A zero of its own sign would be another number: 0 is added.
-    const UInt x = as_bits(block.x + 0.0f);
-    const UInt y = as_bits(block.y + 0.0f);
-    const UInt z = as_bits(block.z + 0.0f);
-
-    UInt index = mix_bits(level + q.extra * 0x9e3779b9u);
-    index = mix_bits(index + x);
-    index = mix_bits(index + y);
-    index = mix_bits(index + z);
-    UInt print = mix_bits_too(level + (cube_face(q.ng) + 8u * q.near) * 0x01000193u + q.extra * 0x85ebca6bu);
-    print = mix_bits_too(print ^ x);
-    print = mix_bits_too(print ^ y);
-    print = mix_bits_too(print ^ z);
+    const UInt x = nearest(p.x * inverse - 0.13f);
+    const UInt y = nearest(p.y * inverse + 0.11f);
+    const UInt z = nearest(p.z * inverse + 0.33f);
+    const UInt side = pick_u(on_x, (UInt)(0u), pick_u(on_y, (UInt)(1u), (UInt)(2u)))
+                      + pick_u(nw < 0.0f, (UInt)(4u), (UInt)(0u)) + 8u * q->near;
+    const UInt corner = (x & 1u) | ((y & 1u) << 1) | ((z & 1u) << 2);
+    const UInt index = mix_bits((x >> 1) * 0x9e3779b1u + (y >> 1) * 0x85ebca77u + (z >> 1) * 0xc2b2ae3du
+                                + level * 0x27d4eb2fu + q->extra * 0x165667b1u);
+    const UInt print = mix_bits_too((x >> 1) * 0x2c1b3c6du + (y >> 1) * 0x297a2d39u + (z >> 1) * 0x9c8f2d35u
+                                    + level * 0x68e31da5u + q->extra * 0xb5297a4du + side * 0x1b56c4e9u);
     CellKey key;
     key.bucket = bucket_of(index, params->cell_slots);
-    // Probing starts at the slot that the last bits name: those of a block are side by side.
-    key.key = fingerprint((print & ~63u) | ((index >> 23) & 56u) | corner);
+    // Probing starts at the slot that the last bits name: those of a block are side by side, and what is
+    // near on a flat surface has the corners that it leaves free.
+    key.key = fingerprint((print & ~63u) | ((index >> 23) & 56u) | (corner ^ (q->near * 7u)));
     return key;
 }
 

@@ -62,6 +62,44 @@ static inline uint find(const __global uint *keys, uint bucket, uint size, uint 
     return NO_SLOT;
 }
 
+/// Slots of the keys of the lanes in `mask`, NO_SLOT of those that are not there or in a full bucket.
+///
+/// Nearly all keys are in the slot where probing starts: all lanes look there at once.
+static inline UInt find_lanes(
+    const __global uint *keys, const __global uint *full_buckets, Mask mask, UInt bucket, uint size, UInt key)
+{
+    const uint shift = popcount(size - 1u);
+    const Mask usable = mask & (GATHER_WORD(full_buckets, bucket >> shift) == 0u);
+    const UInt start = bucket + (key & (size - 1u));
+    const UInt first = GATHER_WORD(keys, start);
+    const Mask there = usable & (first == key);
+    UInt slot = pick_u(there, start, (UInt)(NO_SLOT));
+    const Mask further = usable & !there & (first != 0u);
+    if (any_lane(further)) {
+        uint lane_bucket[W];
+        uint lane_key[W];
+        uint lane_slot[W];
+        store_lanes_u(bucket, lane_bucket);
+        store_lanes_u(key, lane_key);
+        store_lanes_u(slot, lane_slot);
+        for (uint left = lane_bits(further); left; left &= left - 1u) {
+            const uint k = lowest_bit(left);
+            lane_slot[k] = find(keys, lane_bucket[k], size, lane_key[k]);
+        }
+        slot = load_lanes_u(lane_slot);
+    }
+    return slot;
+}
+
+/// Whether no slot of a bucket is taken.
+static inline int bucket_is_empty(const __global uint *keys, uint size)
+{
+    uint any = 0;
+    for (uint i = 0; i < size; ++i)
+        any |= keys[i];
+    return any == 0u;
+}
+
 /// Slots that were looked at before the one that a key took.
 static inline uint probes_before(uint slot, uint size, uint key) { return (slot - key) & (size - 1u); }
 
@@ -77,9 +115,6 @@ static inline void to_fixed(Float value, Float steps, Float u, UInt *low, UInt *
     *low = to_uint(rounded - upper * 0x1p32f);
 }
 
-/// Value of a sum, in steps.
-static inline Float from_fixed(UInt low, UInt high) { return to_float(high) * 0x1p32f + to_float(low); }
-
 /// Add to a 64-bit sum: a carry out of the low word belongs to whoever caused it.
 static inline void add_fixed(volatile __global uint *low, volatile __global uint *high, uint more_low, uint more_high)
 {
@@ -90,6 +125,9 @@ static inline void add_fixed(volatile __global uint *low, volatile __global uint
         atomic_add(high, carry);
 }
 
+/// Count events in two words.
+static inline void count_up(volatile __global uint *words, uint more) { add_fixed(&words[0], &words[1], more, 0u); }
+
 /// Add samples, `count` of them, whose radiance sums up to the fixed-point numbers given, to a cell.
 static inline void add_to_cell(volatile __global Cell *cell, const ulong *sum, uint count)
 {
@@ -98,27 +136,24 @@ static inline void add_to_cell(volatile __global Cell *cell, const ulong *sum, u
     atomic_add(&cell->count, count);
 }
 
-/// Add the samples of the lanes in `mask` to the cells at `slot`: one addition for all of a cell.
-static inline void add_lanes(volatile __global Cell *cells, Mask mask, UInt slot, const UInt *low, const UInt *high)
+/// Sum of the fixed-point numbers of the lanes in `bits`.
+static inline ulong sum_lanes(uint bits, const uint *low, const uint *high)
 {
-    uint lane_slot[W];
-    uint lane_low[3][W];
-    uint lane_high[3][W];
-    store_lanes_u(slot, lane_slot);
-    for (uint c = 0; c < 3; ++c) {
-        store_lanes_u(low[c], lane_low[c]);
-        store_lanes_u(high[c], lane_high[c]);
+    ulong sum_low = 0;
+    ulong sum_high = 0;
+    for (uint left = bits; left; left &= left - 1u) {
+        const uint k = lowest_bit(left);
+        sum_low += low[k];
+        sum_high += high[k];
     }
-    for (uint left = lane_bits(mask); left;) {
-        const uint at = lane_slot[lowest_bit(left)];
-        const uint same = left & lane_bits(slot == at);
-        left &= ~same;
-        ulong sum[3] = {0, 0, 0};
-        for (uint more = same; more; more &= more - 1u) {
-            const uint k = lowest_bit(more);
-            for (uint c = 0; c < 3; ++c)
-                sum[c] += lane_low[c][k] + ((ulong)lane_high[c][k] << 32);
-        }
-        add_to_cell(&cells[at], sum, popcount(same));
-    }
+    return sum_low + (sum_high << 32);
+}
+
+/// Add the samples of the lanes in `bits`, fixed-point numbers, to a cell.
+static inline void add_lanes(
+    volatile __global Cell *cell, uint bits, const uint (*low)[W], const uint (*high)[W])
+{
+    const ulong sum[3] = {sum_lanes(bits, low[0], high[0]), sum_lanes(bits, low[1], high[1]),
+                          sum_lanes(bits, low[2], high[2])};
+    add_to_cell(cell, sum, popcount(bits));
 }

@@ -39,7 +39,8 @@
 #define FILTER_AUTO 0u // the first vertex that a wide lobe reached, over more than a cell
 #define FILTER_NONE 0xFFFFFFFFu // no vertex
 #define VERTEX_NEAR 0x80000000u // set if the path met a surface within a cell of its vertex
-#define VERTEX_MASK 0x7FFFFFFFu // 1 + depth
+#define VERTEX_REJECTED 0x40000000u // set if what was gathered is too large for a cell
+#define VERTEX_MASK 0x3FFFFFFFu // 1 + depth
 #define CELL_JITTER 1u // points are moved before they are told apart by cells
 #define CELL_NEAR 4u // samples of light from near have cells of their own
 #define CELL_IDENTITY 2u // every sample has a cell of its own: nothing is shared (tests)
@@ -154,19 +155,22 @@
 #define COUNTER_SHADOW_RAYS 8u // low word
 #define COUNTER_SHADOW_RAYS_HIGH 9u // high word
 #define COUNTER_REJECTED_SAMPLES 10u // samples that were not finite, or too large to be summed
-#define COUNTER_FAILED_INSERTS 11u // samples that found their part of the table of cells full
-#define COUNTER_REJECTED_CELLS 12u // samples too large for the sums of a cell
-#define COUNTER_UNFILTERED_SAMPLES 13u // samples with a vertex that looked for a cell and found none
-#define COUNTER_CELLS_USED 14u // low word; cells with samples, summed over passes
-#define COUNTER_CELLS_USED_HIGH 15u // high word
-#define COUNTER_CELL_PROBES 16u // low word; slots looked at to find each of these once
-#define COUNTER_CELL_PROBES_HIGH 17u // high word
-#define COUNTER_CHAIN_LIMIT 18u // first path of a chain that must not be started; set by the host
-#define COUNTER_CHAIN_STARTS 19u // paths of chains that ended before the first pass
-#define COUNTER_PENDING_CAMERA 20u // rays since the last film launch
-#define COUNTER_PENDING_BOUNCE 21u
-#define COUNTER_PENDING_SHADOW 22u
-#define COUNTER_FINISHED 23u // first of the ring: samples done of each pass in flight
+#define COUNTER_FAILED_INSERTS 11u // low word; samples that found their part of the table of cells full
+#define COUNTER_FAILED_INSERTS_HIGH 12u // high word
+#define COUNTER_REJECTED_CELLS 13u // low word; samples too large for the sums of a cell
+#define COUNTER_REJECTED_CELLS_HIGH 14u // high word
+#define COUNTER_UNFILTERED_SAMPLES 15u // low word; samples that looked for a cell and found none
+#define COUNTER_UNFILTERED_SAMPLES_HIGH 16u // high word
+#define COUNTER_CELLS_USED 17u // low word; cells with samples, summed over passes
+#define COUNTER_CELLS_USED_HIGH 18u // high word
+#define COUNTER_CELL_PROBES 19u // low word; slots looked at to find each of these once
+#define COUNTER_CELL_PROBES_HIGH 20u // high word
+#define COUNTER_CHAIN_LIMIT 21u // first path of a chain that must not be started; set by the host
+#define COUNTER_CHAIN_STARTS 22u // paths of chains that ended before the first pass
+#define COUNTER_PENDING_CAMERA 23u // rays since the last film launch
+#define COUNTER_PENDING_BOUNCE 24u
+#define COUNTER_PENDING_SHADOW 25u
+#define COUNTER_FINISHED 26u // first of the ring: samples done of each pass in flight
 
 /// Everything that is the same for all paths of a render.
 typedef struct {
@@ -444,12 +448,12 @@ typedef struct {
 /// What a sample gathered behind its cell's vertex.
 typedef struct {
     float radiance[3]; // at the camera
-    uint vertex; // 1 + its depth, VERTEX_NEAR; 0 if there is none
+    uint vertex; // 1 + its depth, VERTEX_NEAR, VERTEX_REJECTED; 0 if there is none
 } Beyond;
 
 /// What a cell gathers: 64-bit fixed-point sums.
 typedef struct {
-    uint low[3]; // of radiance
+    uint low[3]; // of radiance; from resolve_cells on the bits of their mean, a float
     uint count; // samples
     uint high[3]; // of radiance
     uint pad; // fills the record

@@ -8,9 +8,6 @@
 // Dimensions come in pairs.  A vertex at `depth` owns VERTEX_PAIRS of them from PAIR_VERTEX on.
 #define PAIR_PIXEL 0u
 #define PAIR_LENS 1u
-// Pairs beyond those of any vertex: where a sample is moved to before it is told apart by cells.
-#define PAIR_CELL_STORE 0xfffffff0u
-#define PAIR_CELL_LOOK_UP 0xfffffff1u
 #define PAIR_BSDF 0u
 #define PAIR_LIGHT 1u
 #define PAIR_CHOICE 2u      // which lobe, then whether to go on; which light

@@ -22,13 +22,14 @@ static inline UInt pack_unit(Vec3 n)
     return a | (b << 16);
 }
 
-static inline Vec3 unpack_unit(UInt packed)
+/// Direction of a packed vector, not of unit length.
+static inline Vec3 unpack_direction(UInt packed)
 {
     const Float x = to_float(packed & 0xffffu) * (1.0f / 32767.0f) - 1.0f;
     const Float y = to_float(packed >> 16) * (1.0f / 32767.0f) - 1.0f;
     const Float z = 1.0f - fabs(x) - fabs(y);
     const Float fold = max(-z, 0.0f);
-    const Float nx = x + pick(x >= 0.0f, -fold, fold);
-    const Float ny = y + pick(y >= 0.0f, -fold, fold);
-    return normalize3(vec3(nx, ny, z));
+    return vec3(x + pick(x >= 0.0f, -fold, fold), y + pick(y >= 0.0f, -fold, fold), z);
 }
+
+static inline Vec3 unpack_unit(UInt packed) { return normalize3(unpack_direction(packed)); }

@@ -401,7 +401,7 @@ BEYOND = Record(
     "What a sample gathered behind its cell's vertex.",
     _fields("""
     float radiance[3] - at the camera
-    uint vertex - 1 + its depth, VERTEX_NEAR; 0 if there is none
+    uint vertex - 1 + its depth, VERTEX_NEAR, VERTEX_REJECTED; 0 if there is none
     """),
 )
 
@@ -409,7 +409,7 @@ CELL = Record(
     "Cell",
     "What a cell gathers: 64-bit fixed-point sums.",
     _fields("""
-    uint low[3] - of radiance
+    uint low[3] - of radiance; from resolve_cells on the bits of their mean, a float
     uint count - samples
     uint high[3] - of radiance
     uint pad - fills the record
@@ -578,9 +578,12 @@ COUNTERS = (
     ("shadow_rays", "low word"),
     ("shadow_rays_high", "high word"),
     ("rejected_samples", "samples that were not finite, or too large to be summed"),
-    ("failed_inserts", "samples that found their part of the table of cells full"),
-    ("rejected_cells", "samples too large for the sums of a cell"),
-    ("unfiltered_samples", "samples with a vertex that looked for a cell and found none"),
+    ("failed_inserts", "low word; samples that found their part of the table of cells full"),
+    ("failed_inserts_high", "high word"),
+    ("rejected_cells", "low word; samples too large for the sums of a cell"),
+    ("rejected_cells_high", "high word"),
+    ("unfiltered_samples", "low word; samples that looked for a cell and found none"),
+    ("unfiltered_samples_high", "high word"),
     ("cells_used", "low word; cells with samples, summed over passes"),
     ("cells_used_high", "high word"),
     ("cell_probes", "low word; slots looked at to find each of these once"),
@@ -632,7 +635,8 @@ CONSTANTS = (
     ("FILTER_AUTO", 0, "the first vertex that a wide lobe reached, over more than a cell"),
     ("FILTER_NONE", 0xFFFFFFFF, "no vertex"),
     ("VERTEX_NEAR", 0x80000000, "set if the path met a surface within a cell of its vertex"),
-    ("VERTEX_MASK", 0x7FFFFFFF, "1 + depth"),
+    ("VERTEX_REJECTED", 0x40000000, "set if what was gathered is too large for a cell"),
+    ("VERTEX_MASK", 0x3FFFFFFF, "1 + depth"),
     ("CELL_JITTER", 1, "points are moved before they are told apart by cells"),
     ("CELL_NEAR", 4, "samples of light from near have cells of their own"),
     ("CELL_IDENTITY", 2, "every sample has a cell of its own: nothing is shared (tests)"),

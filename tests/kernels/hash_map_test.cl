@@ -19,29 +19,36 @@ kernel void insert_samples(
     uint lane_key[W];
     store_lanes_u(bucket_of(mix_bits(number), slots), lane_bucket);
     store_lanes_u(fingerprint(mix_bits_too(number)), lane_key);
-    UInt low[3];
-    UInt high[3];
-    for (uint c = 0; c < 3; ++c)
-        to_fixed(LOAD(value, c), (Float)(steps), LOAD(u, c), &low[c], &high[c]);
+    uint lane_low[3][W];
+    uint lane_high[3][W];
+    for (uint c = 0; c < 3; ++c) {
+        UInt low;
+        UInt high;
+        to_fixed(LOAD(value, c), (Float)(steps), LOAD(u, c), &low, &high);
+        store_lanes_u(low, lane_low[c]);
+        store_lanes_u(high, lane_high[c]);
+    }
     uint lane_slot[W];
     for (uint k = 0; k < W; ++k)
         lane_slot[k] = find_or_insert(keys, lane_bucket[k], bucket_size(slots), lane_key[k]);
     const UInt place = load_lanes_u(lane_slot);
-    add_lanes(cells, place != NO_SLOT, place, low, high);
+    for (uint left = lane_bits(place != NO_SLOT); left;) {
+        const uint at = lane_slot[lowest_bit(left)];
+        const uint same = left & lane_bits(place == at);
+        left &= ~same;
+        add_lanes(&cells[at], same, lane_low, lane_high);
+    }
     STORE_U(slot, 0, place);
 }
 
-kernel void find_keys(global const uint *key, global const uint *keys, global uint *slot, const uint slots)
+/// Look up keys in buckets, all of them usable.
+kernel void find_keys(
+    global const uint *key, global const uint *keys, global const uint *full, global uint *slot, const uint slots)
 {
     const UInt number = LOAD_U(key, 0);
-    uint lane_bucket[W];
-    uint lane_key[W];
-    uint lane_slot[W];
-    store_lanes_u(bucket_of(mix_bits(number), slots), lane_bucket);
-    store_lanes_u(fingerprint(mix_bits_too(number)), lane_key);
-    for (uint k = 0; k < W; ++k)
-        lane_slot[k] = find(keys, lane_bucket[k], bucket_size(slots), lane_key[k]);
-    STORE_U(slot, 0, load_lanes_u(lane_slot));
+    const UInt place = find_lanes(keys, full, MASK_ALL, bucket_of(mix_bits(number), slots), bucket_size(slots),
+                                  fingerprint(mix_bits_too(number)));
+    STORE_U(slot, 0, place);
 }
 
 /// Fixed-point numbers and back.
