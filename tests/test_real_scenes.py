@@ -96,7 +96,7 @@ def test_veach_mis_looks_as_its_reference(device):
 
 
 def test_veach_bidir_looks_as_its_reference_glass_included(device):
-    """Its walls and table are Lambertian there; a glTF dielectric has a coat, which brightens rooms.
+    """Walls and table are Lambertian there; a glTF dielectric has a coat, which brightens rooms.
 
     So the coat is taken off; the noise of the caustics takes many samples.
     """
