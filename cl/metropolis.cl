@@ -4,53 +4,14 @@
 #include "common/chain.h"
 #include "common/features.h"
 #include "common/hand_in.h"
-#include "common/hash_map.h"
 #include "common/lanes.h"
 #include "common/layout.h"
 #include "common/pixels.h"
 #include "common/pool.h"
 #include "common/rng.h"
+#include "common/splat.h"
 
 static inline Float luminance(Vec3 v) { return 0.2126f * v.x + 0.7152f * v.y + 0.0722f * v.z; }
-
-/// Add `light` to pixels of passes of the ring; what the sums cannot hold is left out and counted.
-static inline void splat(
-    __global const Params *params,
-    volatile __global SplatSum *splats,
-    volatile __global uint *counters,
-    Mask mask,
-    UInt pass,
-    UInt pixel,
-    Vec3 light,
-    UInt random)
-{
-    const float limit = 0x1p60f / params->splat_steps / (float)params->pixel_count;
-    const Mask fits = max3(light) < limit;
-    const uint rejected = count_lanes(mask & !fits);
-    if (rejected > 0u)
-        atomic_add(&counters[COUNTER_REJECTED_SAMPLES], rejected);
-    uint lane_pass[W];
-    uint lane_pixel[W];
-    uint lane_low[3][W];
-    uint lane_high[3][W];
-    store_lanes_u(pass, lane_pass);
-    store_lanes_u(pixel, lane_pixel);
-    const Float value[3] = {light.x, light.y, light.z};
-    for (uint c = 0; c < 3; ++c) {
-        UInt low;
-        UInt high;
-        to_fixed(pick(fits, value[c], (Float)(0.0f)), (Float)(params->splat_steps), unit_float(random), &low, &high);
-        store_lanes_u(low, lane_low[c]);
-        store_lanes_u(high, lane_high[c]);
-        random = mix_bits(random + 0x9e3779b9u);
-    }
-    for (uint left = lane_bits(mask & fits); left; left &= left - 1u) {
-        const uint k = lowest_bit(left);
-        volatile __global SplatSum *sum = &splats[(ulong)lane_pass[k] * params->pixel_count + lane_pixel[k]];
-        for (uint c = 0; c < 3; ++c)
-            add_fixed(&sum->low[c], &sum->high[c], lane_low[c][k], lane_high[c][k]);
-    }
-}
 
 /// Let finished mutations bring their light to the film; return which chains move to them.
 ///
@@ -113,6 +74,7 @@ static inline void finish(
     __global const Params *params,
     __global Float *path,
     __global Float *chain,
+    __global uint *numbers,
     UInt id,
     Mask done,
     __global const float *brightness,
@@ -127,7 +89,7 @@ static inline void finish(
     if (any_lane(bad))
         atomic_add(&counters[COUNTER_REJECTED_SAMPLES], count_lanes(bad));
 
-    const Seed seed = path_seed(path, chain);
+    const Seed seed = chain_seed(params, get_u(path, PATH_SEED), chain, numbers);
     const UInt index = reverse_bits(get_u(path, PATH_SAMPLE));
     const UInt pixel = get_u(path, PATH_PIXEL);
     const UInt paths = get_u(chain, CHAIN_PATHS);
@@ -154,7 +116,7 @@ static inline void finish(
     if (any_lane(moves)) {
         const UInt depth = get_u(path, PATH_STATUS) & DEPTH_MASK;
         const UInt pairs = min(PAIR_VERTEX + (depth + 1u) * VERTEX_PAIRS, (UInt)(params->chain_pairs));
-        keep_numbers(chain, moves, seed, index, params->sampler, pairs);
+        keep_numbers(chain, numbers, moves, seed, index, params->sampler, pairs);
         put_v(chain, CHAIN_RADIANCE_R, pick_v(moves, radiance, get_v(chain, CHAIN_RADIANCE_R)));
         put_u(chain, CHAIN_PIXEL, pick_u(moves, pixel, get_u(chain, CHAIN_PIXEL)));
     }
@@ -174,6 +136,7 @@ static inline uint start(
     __global const Params *params,
     __global Float *path,
     __global Float *chain,
+    __global uint *numbers,
     UInt id,
     Mask free,
     uint pass_limit,
@@ -194,10 +157,10 @@ static inline uint start(
     const UInt index = reverse_bits(sample);
     take_step(chain, starting, !mutation | is_large(paths, params->seed, params->large_steps));
 
-    const Seed seed = chain_seed(key, chain);
+    const Seed seed = chain_seed(params, key, chain, numbers);
     UInt across;
     UInt down;
-    sample_bits(seed, index, (UInt)(PAIR_PIXEL), params->sampler, &across, &down);
+    film_bits(seed, index, params->sampler, &across, &down);
     const UInt column = mul_hi(across, (UInt)(params->crop_width));
     const UInt row = mul_hi(down, (UInt)(params->crop_height));
     Float lens_1 = (Float)(0.0f);
@@ -227,12 +190,13 @@ static inline uint start(
 /// waits.  A path that is not finite, or too large to be summed, is black, so that no chain stays there.
 ///
 /// reads   pool, chains, starts, brightness, counters
-/// writes  pool, chains; candidates; splats (atomic); counters.{finished[], rejected_samples, next_pass,
+/// writes  pool, chains, chain_numbers; candidates; splats (atomic); counters.{finished[], rejected_samples, next_pass,
 ///         chain_starts, pending_camera}
 kernel void mutate_paths(
     __global const Params *params,
     __global float *pool,
     __global float *chains,
+    __global uint *chain_numbers,
     volatile __global uint *counters,
     __global const float *brightness,
     __global const uint *starts,
@@ -249,17 +213,18 @@ kernel void mutate_paths(
     tally.started = 0;
     for (uint item = first; item < end; ++item) {
         __global Float *path = pool_at(pool, item);
-        __global Float *chain = chain_at(params, chains, item);
+        __global Float *chain = chain_at(chains, item);
+        __global uint *numbers = chain_numbers_at(params, chain_numbers, item);
         const UInt id = lanes_before(MASK_ALL) + item * W;
         const UInt status = get_u(path, PATH_STATUS);
         const Mask done = (status & STATUS_MASK) == STATUS_DONE;
         if (any_lane(done)) {
-            finish(params, path, chain, id, done, brightness, candidates, splats, counters, &tally);
+            finish(params, path, chain, numbers, id, done, brightness, candidates, splats, counters, &tally);
             put_u(path, PATH_STATUS, pick_u(done, (UInt)(STATUS_WAITING), status));
         }
         const Mask free = (status & STATUS_MASK) != STATUS_ALIVE;
         if (any_lane(free))
-            tally.started += start(params, path, chain, id, free, pass_limit, chain_limit, starts);
+            tally.started += start(params, path, chain, numbers, id, free, pass_limit, chain_limit, starts);
     }
     hand_in(&tally, counters);
     if (tally.started > 0)

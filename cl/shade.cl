@@ -162,6 +162,7 @@ kernel void shade_paths(
 #endif
 #if METROPOLIS
     __global float *chains,
+    __global uint *chain_numbers,
 #endif
     __global float *pool)
 {
@@ -350,7 +351,7 @@ kernel void shade_paths(
 
     // The seed names the pixel by its place on the film; it travels with the path.
 #if METROPOLIS
-    const Seed seed = path_seed(path, chain_at(params, chains, item));
+    const Seed seed = path_seed(params, path, chains, chain_numbers, item);
 #else
     const Seed seed = get_u(path, PATH_SEED);
 #endif

@@ -90,10 +90,9 @@ class Chains:
         }
 
     def _states(self) -> np.ndarray:
-        """Return the words of the chains before their numbers: ``(blocks, fields, block)``."""
+        """Return the words of all chains: ``(blocks, fields, block)``."""
         words = self.device.read(self.buffers["chains"])
-        blocks = words.reshape(self.count // self.block, -1, self.block)
-        return blocks[:, : layout.CHAIN_INDEX["numbers"]]
+        return words.reshape(-1, len(layout.CHAIN_FIELDS), self.block)
 
     def _sum(self, states: np.ndarray, name: str, dtype: type[np.generic]) -> float:
         values = np.ascontiguousarray(states[:, layout.CHAIN_INDEX[name]]).view(dtype)

@@ -105,6 +105,13 @@ class Plan:
         return any(stage.between_passes for stage in self.stages)
 
     @property
+    def shortest_epoch(self) -> int:
+        """Return the fewest passes that go on without draining the pool."""
+        if not self.features["METROPOLIS"].value:
+            return 1
+        return metropolis.shortest_epoch(self.traits.slots, self.pixel_count)
+
+    @property
     def total_bytes(self) -> int:
         return sum(buffer.bytes for buffer in self.buffers)
 

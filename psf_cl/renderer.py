@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +111,9 @@ class Renderer:
         self.scheduler = Scheduler(
             Hooks(self._bounce, self._film, self._counters, self._limit, self._between),
             self.plan.traits.slots,
-            doubling_epoch if self.plan.in_epochs else None,
+            partial(doubling_epoch, shortest=self.plan.shortest_epoch)
+            if self.plan.in_epochs
+            else None,
         )
         self.scheduler.clock.seconds += self.technique_seconds
 

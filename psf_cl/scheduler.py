@@ -29,12 +29,13 @@ BOUNCES_PER_FILM = 4
 MAX_EPOCH = 64
 
 
-def doubling_epoch(start: int) -> int:
+def doubling_epoch(start: int, shortest: int = 1) -> int:
     """Return the pass before which the epoch ends that starts with pass ``start``.
 
-    Epochs are 1, 1, 2, 4 .. MAX_EPOCH passes long: draining the pool soon costs next to nothing.
+    Epochs are 1, 1, 2, 4 .. MAX_EPOCH passes long, or so many times ``shortest`` up to at least
+    that: draining the pool soon costs next to nothing.
     """
-    return start + min(max(start, 1), MAX_EPOCH)
+    return start + max(min(max(start, 1), MAX_EPOCH), shortest)
 
 
 @dataclass(frozen=True)

@@ -142,7 +142,7 @@
 #define CHAIN_LARGE_ACCEPTED 12u // uint
 #define CHAIN_SMALL 13u // uint; small steps
 #define CHAIN_SMALL_ACCEPTED 14u // uint
-#define CHAIN_NUMBERS 15u // uint; first of the random numbers of the state
+#define CHAIN_FIELD_COUNT 15u
 
 #define COUNTER_NEXT_PIXEL 0u // next pixel to be started, counted from the first pixel of next_pass
 #define COUNTER_NEXT_PASS 1u // pass that next_pixel 0 belongs to
@@ -225,9 +225,10 @@ typedef struct {
     float previous_scale_y; // tangent of half the vertical field of view
     uint chain_start; // independent paths of each chain, before the first state
     uint chain_pairs; // pairs of random numbers that a chain keeps
+    uint chain_numbers; // words from those of a chain to those of the next
     float large_steps; // chance of a path of new random numbers
     float splat_steps; // fixed-point steps of a splat as bright as the mean, a power of two
-    uint pad[3]; // fills the record
+    uint pad[2]; // fills the record
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.

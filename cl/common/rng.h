@@ -101,7 +101,8 @@ LARGE_FUNCTION void new_bits(
 typedef struct {
     UInt key;                     // of the number of the path in its chain
     UInt known;                   // pairs of numbers of the chain's state; 0: all of the path's are new
-    __global const uint *numbers; // of the states of the W chains
+    __global const uint *numbers; // of the chain's state, of the first of W chains
+    uint stride;                  // numbers of a chain
 } Seed;
 
 /// A number a bit further on, or back, on the circle from 0 to 2^32: steps of 2^-10 to 2^-6 of it, each
@@ -115,22 +116,18 @@ static inline UInt mutated(UInt number, UInt random)
     return number + pick_u((random & 1u) != 0u, distance, -distance);
 }
 
-/// Two uniform 32-bit numbers: those of the chain's state, mutated, or new ones.
+/// Two uniform 32-bit numbers: those of the chain's state, mutated, or new and independent ones.
+///
+/// `sampler` is not looked at.
 LARGE_FUNCTION void sample_bits(
     Seed seed, UInt reversed_index, UInt pair, uint sampler, UInt *first, UInt *second)
 {
+    random_bits(pair_key(seed.key, pair), reversed_index, first, second);
     const Mask known = pair < seed.known;
-    *first = (UInt)(0u);
-    *second = (UInt)(0u);
-    if (any_lane(!known))
-        new_bits(seed.key, reversed_index, pair, sampler, first, second);
     if (any_lane(known)) {
-        const UInt at = pick_u(known, pair, (UInt)(0u)) * (2u * BLOCK) + lanes_before(MASK_ALL);
-        UInt a;
-        UInt b;
-        random_bits(pair_key(seed.key, pair), reversed_index, &a, &b);
-        *first = pick_u(known, mutated(GATHER_WORD(seed.numbers, at), a), *first);
-        *second = pick_u(known, mutated(GATHER_WORD(seed.numbers, at + BLOCK), b), *second);
+        const UInt at = lanes_before(MASK_ALL) * seed.stride + pick_u(known, pair, (UInt)(0u)) * 2u;
+        *first = pick_u(known, mutated(GATHER_WORD(seed.numbers, at), *first), *first);
+        *second = pick_u(known, mutated(GATHER_WORD(seed.numbers, at + 1u), *second), *second);
     }
 }
 #else

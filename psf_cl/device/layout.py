@@ -118,9 +118,9 @@ PARAMS = Record(
     float previous_scale_y - tangent of half the vertical field of view
     uint chain_start - independent paths of each chain, before the first state
     uint chain_pairs - pairs of random numbers that a chain keeps
+    uint chain_numbers - words from those of a chain to those of the next
     float large_steps - chance of a path of new random numbers
     float splat_steps - fixed-point steps of a splat as bright as the mean, a power of two
-    uint pad[3] - fills the record
     """),
 )
 
@@ -562,7 +562,6 @@ CHAIN_FIELDS = (
     ("large_accepted", "uint"),
     ("small", "uint; small steps"),
     ("small_accepted", "uint"),
-    ("numbers", "uint; first of the random numbers of the state"),
 )
 
 #: Words of the counters, all uint.
@@ -685,10 +684,11 @@ def _path_lines() -> list[str]:
 
 
 def _chain_lines() -> list[str]:
-    return [
+    lines = [
         _define(f"CHAIN_{name.upper()}", f"{index}u", meaning)
         for index, (name, meaning) in enumerate(CHAIN_FIELDS)
     ]
+    return [*lines, _define("CHAIN_FIELD_COUNT", f"{len(CHAIN_FIELDS)}u")]
 
 
 def path_field_count(values: Mapping[str, int]) -> int:

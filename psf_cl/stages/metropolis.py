@@ -22,6 +22,9 @@ KEPT_VERTICES = 24
 #: Mutations of a chain that fit into the passes in flight: chains of long paths are slower.
 MUTATIONS_IN_FLIGHT = 64
 
+#: Mutations of a chain in the shortest epoch: its end costs about ten.
+MUTATIONS_PER_EPOCH = 128
+
 #: Steps of a splat of mean brightness: sums seldom need their high words, and nothing shows.
 MOST_STEPS = 2.0**24
 
@@ -45,9 +48,14 @@ def kept_pairs(max_depth: int) -> int:
     return layout.CONSTANT["PAIR_VERTEX"] + layout.CONSTANT["VERTEX_PAIRS"] * vertices
 
 
-def chain_words(max_depth: int) -> int:
-    """Return the words of a chain."""
-    return layout.CHAIN_INDEX["numbers"] + 2 * kept_pairs(max_depth)
+def kept_numbers(max_depth: int) -> int:
+    """Return the words from the numbers of a chain to those of the next: whole cache lines."""
+    return -(-2 * kept_pairs(max_depth) // 16) * 16
+
+
+def shortest_epoch(chains: int, pixel_count: int) -> int:
+    """Return the passes of the shortest epoch."""
+    return max(MUTATIONS_PER_EPOCH * chains // pixel_count, 1)
 
 
 def parameters(settings: Settings, chains: int, pixel_count: int) -> dict[str, Any]:
@@ -56,6 +64,7 @@ def parameters(settings: Settings, chains: int, pixel_count: int) -> dict[str, A
     return {
         "chain_start": starts_per_chain(chains),
         "chain_pairs": kept_pairs(settings.max_depth),
+        "chain_numbers": kept_numbers(settings.max_depth),
         "large_steps": settings.large_steps,
         "splat_steps": min(steps, MOST_STEPS),
     }
@@ -91,10 +100,13 @@ def plan(context: Context) -> StageSpec | None:
     chains = context.traits.slots
     float32, uint32 = np.dtype(np.float32), np.dtype(np.uint32)
     started = ("origin", "direction", "beta", "radiance", "seed", "sample", "pixel", "status")
-    words = chain_words(context.max_depth)
+    numbers = kept_numbers(context.max_depth)
     buffers = (
         *pool_buffers(context),
-        BufferSpec("chains", float32, chains * words, f"states of {chains} chains"),
+        BufferSpec(
+            "chains", float32, chains * len(layout.CHAIN_FIELDS), f"states of {chains} chains"
+        ),
+        BufferSpec("chain_numbers", uint32, chains * numbers, "random numbers of their paths"),
         BufferSpec(
             "candidates",
             float32,
@@ -109,7 +121,8 @@ def plan(context: Context) -> StageSpec | None:
         reads=started,
         writes=started,
         # Two splats, and a state that is read and written.
-        record_bytes=4 * layout.SPLAT_SUM.dtype.itemsize + 2 * 4 * words,
+        record_bytes=4 * layout.SPLAT_SUM.dtype.itemsize
+        + 2 * 4 * (len(layout.CHAIN_FIELDS) + numbers),
         runs=True,
     )
     return StageSpec(
