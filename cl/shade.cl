@@ -144,7 +144,7 @@ kernel void shade_paths(
 #if TANGENTS
     __global const Tangents *tangents,
 #endif
-    __global const Material *materials TEXTURE_PARAMETERS COLOR_PARAMETERS,
+    __global const Material *materials TEXTURE_PARAMETERS COLOR_PARAMETERS INSTANCE_PARAMETERS,
 #if CONNECT
     __global const Light *lights CHOICE_PARAMETERS,
 #endif
@@ -222,7 +222,7 @@ kernel void shade_paths(
 #if SMOOTH
                                    , normals
 #endif
-    );
+                                   INSTANCE_ARGUMENTS);
 #if TRANSMISSION
     beta = mul(beta, attenuation(hit, s, FIELD(path, PATH_HIT_T), materials));
 #endif
@@ -286,7 +286,7 @@ kernel void shade_paths(
     Vec3 tangent;
     Vec3 bitangent;
     const Float anisotropy =
-        map_normal(hit, &s, u, v, wo, materials, tangents TEXTURE_ARGUMENTS, &tangent, &bitangent);
+        map_normal(hit, &s, u, v, wo, materials, tangents TEXTURE_ARGUMENTS INSTANCE_ARGUMENTS, &tangent, &bitangent);
 #else
     const Float anisotropy = (Float)(0.0f);
 #endif

@@ -12,6 +12,7 @@ import numpy as np
 from psf_cl.device import layout
 from psf_cl.errors import DeviceError, InputError
 from psf_cl.image import AOVS
+from psf_cl.instancing import Levels, split
 from psf_cl.measure.timing import Declared
 from psf_cl.scene.model import (
     TEXTURE_FIELDS,
@@ -77,6 +78,7 @@ class Plan:
         scene_buffers: tables of the scene.
         crop: (x, y, width, height) of what is rendered.
         building: what building the tree needs for a while.
+        levels: how the scene is split into two levels, or None.
     """
 
     features: dict[str, Feature]
@@ -88,6 +90,7 @@ class Plan:
     ring: int
     traits: DeviceTraits
     building: tuple[BufferSpec, ...] = ()
+    levels: Levels | None = None
 
     @property
     def pixel_count(self) -> int:
@@ -242,10 +245,13 @@ def make_plan(
         _check_metropolis(outputs, halves)
         traits = dataclasses.replace(traits, slots=metropolis.chain_count(settings, traits))
     shapes = visible_shapes(scene)
-    triangles = sum(len(shape.mesh.triangles) for shape in shapes)
-    corners = _few_corners(scene, triangles, traits)
+    shown = sum(len(shape.mesh.triangles) for shape in shapes)
+    levels = split(scene)
+    triangles = shown if levels is None else levels.triangle_count
+    corners = _few_corners(scene, shown, traits)
     features = _features(scene, settings, outputs)
-    features["FEW"] = _few(triangles, corners, traits)
+    features["FEW"] = _few(shown, corners, traits)
+    features["INSTANCES"] = _instances(levels, shown)
     if full:
         features = _all_on(features)
     pixel_count = width * height
@@ -259,6 +265,7 @@ def make_plan(
         halves=halves,
         max_depth=settings.max_depth,
         triangle_count=triangles,
+        instance_count=0 if levels is None else levels.instance_count,
         corner_count=corners,
         material_count=len(scene.materials),
         texture_count=len(scene.textures),
@@ -298,6 +305,7 @@ def make_plan(
         context.ring,
         traits,
         () if context.on("FEW") else _building(triangles),
+        levels,
     )
     lacking = plan.lacks(room) if room is not None else None
     if lacking is None:
@@ -374,6 +382,15 @@ def _ring(
     while ring < wanted and ring * 2 <= affordable:
         ring *= 2
     return ring
+
+
+def _instances(levels: Levels | None, shown: int) -> Feature:
+    """Return whether meshes have trees of their own, with the bits of an index in them."""
+    if levels is None:
+        return Feature(0, "few triangles would be saved by placing meshes more than once")
+    places = f"{levels.place_count} places of {len(levels.parts)} meshes"
+    kept = f"{levels.triangle_count} triangles in place of {shown}"
+    return Feature(levels.index_bits, f"{places}: {kept}")
 
 
 def _few_corners(scene: Scene, triangles: int, traits: DeviceTraits) -> int:
@@ -539,6 +556,8 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     }
     # A list of triangles is what small scenes have in place of something.
     full["FEW"] = Feature(0, f"a tree for measuring, though {features['FEW'].reason}")
+    # Neither are there places of what is there once.
+    full["INSTANCES"] = features["INSTANCES"]
     # Other lights would be drawn: another image.
     full["LIGHT_SAMPLING"] = features["LIGHT_SAMPLING"]
     # Chains are another integrator, which has no images beside the one.
@@ -601,6 +620,10 @@ def _scene_buffers(context: Context, scene: Scene) -> tuple[BufferSpec, ...]:
             BufferSpec("blocks", block, -(-triangles // 2), "leaves (estimate)"),
             BufferSpec("nodes", node, -(-triangles // 12), "inner nodes (estimate)"),
         ]
+    if context.on("INSTANCES"):
+        buffers.append(
+            BufferSpec("instances", layout.INSTANCE.dtype, context.instance_count, "places")
+        )
     if context.on("SMOOTH"):
         buffers.append(BufferSpec("normals", layout.NORMALS.dtype, triangles, "shading normals"))
     if context.on("TEXTURES"):

@@ -25,8 +25,10 @@ from psf_cl.device.device import Buffer, Device, open_device
 from psf_cl.device.light_tree import LightTree, warm_up_light_tree
 from psf_cl.device.program import Launch, Program, load_program
 from psf_cl.device.sources import source_digest
+from psf_cl.device.two_levels import build_two_levels
 from psf_cl.errors import DeviceError, InputError, NoRoomError
 from psf_cl.image import Image
+from psf_cl.instancing import Placed, place
 from psf_cl.measure.errors import error_of_halves
 from psf_cl.plan import Plan, Room, make_plan
 from psf_cl.scene.digest import scene_digest
@@ -582,7 +584,8 @@ class Renderer:
 
     def _upload_scene(self) -> tables.Geometry:
         scene, planned = self.scene, {spec.name for spec in self.plan.scene_buffers}
-        geometry = tables.flatten(scene)
+        self.placed = place(scene, self.plan.levels) if self.plan.levels is not None else None
+        geometry = tables.flatten(scene) if self.placed is None else self.placed.geometry
         self.lights = lights = tables.light_table(scene, geometry, self.settings.light_sampling)
         textures, texels = tables.texture_tables(
             scene.textures if "textures" in planned else (), geometry.count
@@ -632,8 +635,9 @@ class Renderer:
         values: dict[str, Any] = tables.camera_values(
             scene.cameras[scene.camera], scene.width, scene.height
         )
+        in_world = slice(None if self.placed is None else self.placed.starts[1])
         values["camera_origin"] = tables.off_surfaces(
-            values["camera_origin"], values["camera_forward"], geometry.surfaces
+            values["camera_origin"], values["camera_forward"], geometry.surfaces[in_world]
         )
         image = scene.environment.image
         values |= {
@@ -675,6 +679,8 @@ class Renderer:
 
     def _build_bvh(self, geometry: tables.Geometry) -> Bvh:
         device = self.device
+        if self.placed is not None:
+            return self._build_levels(self.placed)
         inputs = [device.upload("positions", geometry.positions.reshape(-1))]
         try:
             if self.plan.features["ALPHA"].value:
@@ -684,6 +690,24 @@ class Renderer:
         finally:
             device.release(*inputs)
         self.buffers |= {"nodes": bvh.nodes, "blocks": bvh.blocks}
+        return bvh
+
+    def _build_levels(self, placed: Placed) -> Bvh:
+        """Build the trees of a scene of two levels, and tell its instances where theirs begin."""
+        cuts = placed.starts[1:-1]
+        cut_out = None
+        if self.plan.features["ALPHA"].value:
+            cut_out = np.split(placed.geometry.cut_out, cuts)
+        bvh, roots = build_two_levels(
+            self.device,
+            np.split(placed.geometry.positions, cuts),
+            placed.boxes,
+            placed.first,
+            cut_out,
+        )
+        self.buffers |= {"nodes": bvh.nodes, "blocks": bvh.blocks}
+        placed.instances["root"] = roots[placed.part_of]
+        self.buffers["instances"] = self.device.upload("instances", placed.instances)
         return bvh
 
     def _build_light_tree(self, geometry: tables.Geometry) -> None:

@@ -475,11 +475,12 @@ def test_plan_follows_the_options(all_features, capsys):
         return planned, {name for name, f in planned["features"].items() if not f["value"]}
 
     plan, off = features("")
-    layers = {"CELLS", "FEW", "LAYERS", "METROPOLIS", "TANGENTS", "VERTEX_COLORS"}
-    off_by_default = layers | {"AOV_DIRECT", "AOV_FEATURES"}
+    unused = {"BASE", "CELLS", "FEW", "INSTANCES", "LAYERS", "LIGHT_SAMPLING", "METROPOLIS"}
+    unused |= {"SEEN", "TANGENTS", "VERTEX_COLORS"}
+    off_by_default = unused | {"AOV_DIRECT", "AOV_FEATURES"}
     assert off == off_by_default and plan["crop"] == [0, 0, 24, 16]
     plan, off = features("--camera above --aov direct --crop 1,2,3,4")
-    assert off == layers | {"LENS", "AOV_FEATURES"} and plan["crop"] == [1, 2, 3, 4]
+    assert off == unused | {"LENS", "AOV_FEATURES"} and plan["crop"] == [1, 2, 3, 4]
 
 
 @pytest.mark.parametrize("output", ["sky.exr", "checks.exr", "box.exr"])

@@ -170,6 +170,12 @@ def test_obj_materials_keep_color_emission_and_texture(tmp_path):
     assert corners(by_name["dark wood"].mesh) == [[[0, 1, 0], [1, 0, 0], [0, 0, 0]]]
 
 
+@pytest.mark.filterwarnings("error")
+def test_obj_normals_beyond_float_are_none(tmp_path):
+    text = TRIANGLE + "vn 1e200 0 0\nf 1//1 2//1 3//1\n"
+    assert obj(tmp_path, text).shapes[0].mesh.normals is None
+
+
 def test_missing_mtl_and_textures_are_noted_not_fatal(tmp_path):
     (tmp_path / "b.mtl").write_text("newmtl m\nKd 0.1 0.2 0.3\nmap_Kd gone.png\n")
     text = TRIANGLE + "mtllib a.mtl\nmtllib b.mtl\nusemtl m\nf 1 2 3\nusemtl n\nf 1 2 3\n"
@@ -202,6 +208,18 @@ def ply_header(form: str, vertices: int, faces: int, more: str = "") -> str:
         f"property float z\n{more}element face {faces}\nproperty list uchar int vertex_indices\n"
         "end_header\n"
     )
+
+
+def ply_ragged() -> bytes:
+    """Return a PLY file whose vertices have lists of different lengths as coordinates."""
+    head = ply_header("ascii", 3, 1).replace("property float x", "property list uchar float x")
+    return (head + "1 0 0 0\n2 1 1 0 0\n1 0 1 0\n3 0 1 2\n").encode()
+
+
+def ply_of_float_counts() -> bytes:
+    """Return a binary PLY file whose faces have a number of corners that is no integer."""
+    head = ply_header("binary_little_endian", 3, 1).replace("list uchar", "list float")
+    return head.encode() + struct.pack("<9f", *range(9)) + struct.pack("<f3i", 3.0, 0, 1, 2)
 
 
 def test_an_ascii_ply_of_triangles_and_quads_comes_through(tmp_path):
@@ -268,6 +286,9 @@ def test_binary_and_ascii_stl_come_through(tmp_path):
         ("a.ply", ply_header("ascii", 10**15, 1).encode() + b"0 0 0\n", "a.ply"),
         ("a.ply", ply_header("binary_little_endian", 10**18, 1).encode(), "not a sound PLY"),
         ("a.ply", ply_header("ascii", 0, 0).encode(), "has no triangles"),
+        # Lists in place of numbers come out of the reader ragged.
+        ("a.ply", ply_ragged(), "not a sound PLY"),
+        ("a.ply", ply_of_float_counts(), "not a sound PLY"),
         ("a.ply", ply_header("ascii", 3, 1, "property half w\n").encode(), "not a sound PLY"),
         ("a.stl", b"", "a.stl"),
         ("a.stl", stl(0), "a.stl"),

@@ -254,10 +254,12 @@ def test_every_flag_at_once_renders(wants):
         screen_filter="path_space",
         light_sampling="hierarchy",
     )
-    # Chains of paths would leave out what samples of pixels are for.
+    # Chains of paths would leave out what samples of pixels are for, places the list of triangles.
     off = {name for name, feature in opened.plan.features.items() if not feature.value}
-    assert off == {"METROPOLIS"}
-    assert opened.plan.left_out == (("metropolis", "integrator is path"),)
+    assert off == {"METROPOLIS", "INSTANCES"}
+    left_out = dict(opened.plan.left_out)
+    assert left_out.keys() == {"metropolis", "instances"}
+    assert left_out["metropolis"] == "integrator is path"
     opened.render(spp=4)
     image = opened.image()
     assert set(image.aovs) == {"rgb", *AOVS}

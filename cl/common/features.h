@@ -61,6 +61,9 @@
 #ifndef FEW
 #error "FEW must be 0 (a tree), or the most corners of the list of triangles"
 #endif
+#ifndef INSTANCES
+#error "INSTANCES must be 0, or the bits of a hit's index below the number of the instance"
+#endif
 #ifndef CELLS
 #error "CELLS must be 0, 1 (all of a vertex's light is shared) or 2 (that of its diffuse base)"
 #endif

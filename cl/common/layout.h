@@ -6,6 +6,7 @@
 #define NO_HIT 0xFFFFFFFFu
 #define NO_LIGHT 0xFFFFFFFFu
 #define NO_TEXTURE 0xFFFFFFFFu
+#define OWN_MATERIAL 0xFFFFFFFFu // each triangle has its own
 #define MATERIAL_TWO_SIDED_EMISSION 1u
 #define MATERIAL_ALPHA_MASK 2u // hits must look up the alpha
 #define MATERIAL_ALPHA_BLEND 4u // with a chance of alpha a hit is there
@@ -265,6 +266,21 @@ typedef struct {
     float ng[3]; // unit normal of the front side
     float pad; // fills the record
 } Surface;
+
+/// A placing of a mesh that has a tree of its own; two cache lines.
+typedef struct {
+    float x_row[3]; // of the matrix from the mesh to the world
+    uint base; // index of a hit minus that of its triangle
+    float y_row[3]; // second row
+    uint root; // node where the mesh's tree begins
+    float z_row[3]; // third row
+    uint material; // of all triangles, or OWN_MATERIAL
+    float position[3]; // of the mesh's origin; world, m
+    float offset; // m along ng that clears the rounding error of any point; 0: the triangles' own
+    float inverse[9]; // from the world to the mesh, without position, row by row
+    float mirroring; // -1 if the mesh is mirrored, else 1
+    uint pad[6]; // fills the record
+} Instance;
 
 /// Shading normals of a triangle's corners; all zero if it is flat.
 typedef struct {

@@ -47,6 +47,14 @@ static inline Vec3 with_visible_mirror(Vec3 ns, Vec3 ng, Vec3 wo)
     return pick_v(lacks > 0.0f, normalize3(add(lifted, wo)), ns);
 }
 
+#if INSTANCES
+/// The unit direction `t` of a mesh in the world, unit; none stays none.
+static inline Vec3 placed_tangent(__global const Instance *instances, UInt instance, Vec3 t)
+{
+    return pick_v(dot3(t, t) > 0.0f, normalize3(placed_direction(instances, instance, t)), t);
+}
+#endif
+
 /// Give `s` its mapped normal, and the frame of the shading normal the direction of the tangent.
 ///
 /// What is seen from behind is mapped as from the front and then turned: a bump is a dent there.
@@ -58,7 +66,7 @@ LARGE_FUNCTION Float map_normal(
     Float v,
     Vec3 wo,
     __global const Material *materials,
-    __global const Tangents *tangents TEXTURE_PARAMETERS,
+    __global const Tangents *tangents TEXTURE_PARAMETERS INSTANCE_PARAMETERS,
     Vec3 *tangent,
     Vec3 *bitangent)
 {
@@ -66,16 +74,23 @@ LARGE_FUNCTION Float map_normal(
     const Float side = pick(s.front, (Float)(1.0f), (Float)(-1.0f));
     const Vec3 n = scale(s.ns, side);
     const Float w = 1.0f - u - v;
-    const Vec3 t0 = GATHER_COLOR(tangents, s.triangle, t0);
-    const Vec3 t1 = GATHER_COLOR(tangents, s.triangle, t1);
-    const Vec3 t2 = GATHER_COLOR(tangents, s.triangle, t2);
+    Vec3 t0 = GATHER_COLOR(tangents, s.triangle, t0);
+    Vec3 t1 = GATHER_COLOR(tangents, s.triangle, t1);
+    Vec3 t2 = GATHER_COLOR(tangents, s.triangle, t2);
+    Float handedness = GATHER(tangents, s.triangle, t0[3]);
+#if INSTANCES
+    t0 = placed_tangent(instances, s.instance, t0);
+    t1 = placed_tangent(instances, s.instance, t1);
+    t2 = placed_tangent(instances, s.instance, t2);
+    handedness *= GATHER(instances, s.instance, mirroring);
+#endif
     Vec3 t = add_scaled(add_scaled(scale(t0, w), t1, u), t2, v);
     t = add_scaled(t, n, -dot3(t, n));
     Vec3 b;
     Vec3 any_t;
     make_frame(n, &any_t, &b);
     t = normalize3(pick_v(dot3(t, t) > 1e-12f, t, any_t));
-    b = scale(cross3(n, t), pick(GATHER(tangents, s.triangle, t0[3]) < 0.0f, (Float)(-1.0f), (Float)(1.0f)));
+    b = scale(cross3(n, t), pick(handedness < 0.0f, (Float)(-1.0f), (Float)(1.0f)));
 
     Vec3 mapped = n;
     Float anisotropy = (Float)(0.0f);

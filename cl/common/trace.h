@@ -1,4 +1,4 @@
-// The rays of all lanes through the scene: a tree, or every triangle where there are FEW.
+// The rays of all lanes through the scene: a tree, one of two levels, or all triangles of FEW.
 //
 // GEOMETRY_BUFFERS are what a kernel needs for it; before it calls, it says DEFINE_RAY_SEEDS.
 #pragma once
@@ -8,10 +8,15 @@
 #include "alpha.h"
 #include "few.h"
 #include "traverse.h"
+#include "instances.h"
 
 #if FEW
 #define TRIANGLE_BUFFERS __global const float *corners, __global const uint *faces
 #define TRIANGLE_ARGUMENTS corners, faces
+#elif INSTANCES
+#define TRIANGLE_BUFFERS                                                                           \
+    __global const BvhNode *nodes, __global const TriangleBlock *blocks, __global const Instance *instances
+#define TRIANGLE_ARGUMENTS nodes, blocks, instances
 #else
 #define TRIANGLE_BUFFERS __global const BvhNode *nodes, __global const TriangleBlock *blocks
 #define TRIANGLE_ARGUMENTS nodes, blocks
@@ -30,7 +35,11 @@ static inline Hits closest_hits(
 #else
     RaySetups rays;
     set_up_rays(&rays, active, origin, direction, (Float)(INFINITY));
+#if INSTANCES
+    return trace_closest_levels(nodes, blocks, instances, &rays, origin, direction ALPHA_ARGUMENTS);
+#else
     return trace_closest(nodes, blocks, &rays ALPHA_ARGUMENTS);
+#endif
 #endif
 }
 
@@ -43,6 +52,10 @@ static inline Mask blocked_rays(
 #else
     RaySetups rays;
     set_up_rays(&rays, active, origin, toward, (Float)(1.0f));
+#if INSTANCES
+    return trace_any_levels(nodes, blocks, instances, &rays, origin, toward ALPHA_ARGUMENTS);
+#else
     return trace_any(nodes, blocks, &rays ALPHA_ARGUMENTS);
+#endif
 #endif
 }

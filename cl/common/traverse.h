@@ -11,6 +11,9 @@
 #define ALPHA_PARAMETERS
 #define ALPHA_ARGUMENTS
 #endif
+#ifndef INSTANCES
+#define INSTANCES 0
+#endif
 #if !FEW
 
 #ifndef STACK_SIZE
@@ -48,6 +51,53 @@ static inline uint bits_of_8(int8 mask)
 #endif
 }
 
+/// Return which of the children that a ray meets is the nearest; the others wait, the nearest on top.
+static inline uint descend(
+    __global const BvhNode *node, uint met, float8 near, uint *waiting, float *entered, uint *waiting_count)
+{
+    float entry[8];
+    vstore8(near, 0, entry);
+    uint k = lowest_bit(met);
+    met &= met - 1u;
+    uint next = node->child[k];
+    float nearest = entry[k];
+    uint count = *waiting_count;
+    const uint base = count;
+    while (met && count < STACK_SIZE) {
+        k = lowest_bit(met);
+        met &= met - 1u;
+        uint child = node->child[k];
+        float at = entry[k];
+        if (at < nearest) {
+            const uint other = next;
+            const float farther = nearest;
+            next = child;
+            nearest = at;
+            child = other;
+            at = farther;
+        }
+        uint place = count++;
+        while (place > base && entered[place - 1] < at) {
+            entered[place] = entered[place - 1];
+            waiting[place] = waiting[place - 1];
+            --place;
+        }
+        entered[place] = at;
+        waiting[place] = child;
+    }
+    *waiting_count = count;
+    return next;
+}
+
+// Of scenes of two levels an instance's hits are its base plus the index of the triangle.
+#if INSTANCES
+#define BASE_PARAMETER , uint base
+#define TRIANGLE_OF(id) (((id) & ~ALPHA_BIT) + base)
+#else
+#define BASE_PARAMETER
+#define TRIANGLE_OF(id) ((id) & ~ALPHA_BIT)
+#endif
+
 /// Look for hits of a ray below `next` (a child[]) that are nearer than `hit`; of equally near ones that
 /// of the lowest index counts.
 static inline void trace_closest_from(
@@ -55,7 +105,7 @@ static inline void trace_closest_from(
     __global const TriangleBlock *blocks,
     const RaySetup *ray,
     uint next,
-    Hit *hit ALPHA_PARAMETERS)
+    Hit *hit BASE_PARAMETER ALPHA_PARAMETERS)
 {
     Hit best = *hit;
     uint waiting[STACK_SIZE];
@@ -80,7 +130,7 @@ static inline void trace_closest_from(
                     const uint k = lowest_bit(nearer);
                     nearer &= nearer - 1u;
                     const uint id = block->id[k];
-                    const uint triangle = id & ~ALPHA_BIT;
+                    const uint triangle = TRIANGLE_OF(id);
                     if ((t[k] < best.t || (t[k] == best.t && triangle < best.triangle))
                         && IS_THERE(id, u[k], v[k])) {
                         best.t = t[k];
@@ -95,36 +145,7 @@ static inline void trace_closest_from(
             float8 near;
             met = bits_of_8(intersect_boxes(node, ray, best.t, &near));
             if (met) {
-                // The nearest child is next; the others wait, the nearest of them on top.
-                float entry[8];
-                vstore8(near, 0, entry);
-                uint k = lowest_bit(met);
-                met &= met - 1u;
-                next = node->child[k];
-                float nearest = entry[k];
-                const uint base = count;
-                while (met && count < STACK_SIZE) {
-                    k = lowest_bit(met);
-                    met &= met - 1u;
-                    uint child = node->child[k];
-                    float at = entry[k];
-                    if (at < nearest) {
-                        const uint other = next;
-                        const float farther = nearest;
-                        next = child;
-                        nearest = at;
-                        child = other;
-                        at = farther;
-                    }
-                    uint place = count++;
-                    while (place > base && entered[place - 1] < at) {
-                        entered[place] = entered[place - 1];
-                        waiting[place] = waiting[place - 1];
-                        --place;
-                    }
-                    entered[place] = at;
-                    waiting[place] = child;
-                }
+                next = descend(node, met, near, waiting, entered, &count);
                 continue;
             }
         }
@@ -186,7 +207,9 @@ static inline bool trace_any_from(
     return blocked;
 }
 
-#if W == 1
+#if INSTANCES
+// instances.h has the rest.
+#elif W == 1
 /// Return the first hit of a ray; of equally near ones that of the lowest index.
 static inline Hits trace_closest(
     __global const BvhNode *nodes, __global const TriangleBlock *blocks, const RaySetups *rays ALPHA_PARAMETERS)

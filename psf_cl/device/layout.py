@@ -171,6 +171,24 @@ SURFACE = Record(
     """),
 )
 
+INSTANCE = Record(
+    "Instance",
+    "A placing of a mesh that has a tree of its own; two cache lines.",
+    _fields("""
+    float x_row[3] - of the matrix from the mesh to the world
+    uint base - index of a hit minus that of its triangle
+    float y_row[3] - second row
+    uint root - node where the mesh's tree begins
+    float z_row[3] - third row
+    uint material - of all triangles, or OWN_MATERIAL
+    float position[3] - of the mesh's origin; world, m
+    float offset - m along ng that clears the rounding error of any point; 0: the triangles' own
+    float inverse[9] - from the world to the mesh, without position, row by row
+    float mirroring - -1 if the mesh is mirrored, else 1
+    uint pad[6] - fills the record
+    """),
+)
+
 NORMALS = Record(
     "Normals",
     "Shading normals of a triangle's corners; all zero if it is flat.",
@@ -432,6 +450,7 @@ RECORDS = (
     TRIANGLE_BLOCK,
     BINARY_NODE,
     SURFACE,
+    INSTANCE,
     NORMALS,
     UVS,
     VERTEX_COLORS,
@@ -601,6 +620,7 @@ CONSTANTS = (
     ("NO_HIT", 0xFFFFFFFF, ""),
     ("NO_LIGHT", 0xFFFFFFFF, ""),
     ("NO_TEXTURE", 0xFFFFFFFF, ""),
+    ("OWN_MATERIAL", 0xFFFFFFFF, "each triangle has its own"),
     ("MATERIAL_TWO_SIDED_EMISSION", 1, ""),
     ("MATERIAL_ALPHA_MASK", 2, "hits must look up the alpha"),
     ("MATERIAL_ALPHA_BLEND", 4, "with a chance of alpha a hit is there"),

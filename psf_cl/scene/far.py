@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from psf_cl.scene import transform
-from psf_cl.scene.model import Scene
+from psf_cl.scene.model import Mesh, Scene
 
 #: A scene is far away if the origin is so many times as far from its middle as its corners are.
 #: Coordinates have 24 bits: as far out as this they still have 22 for what is in the scene.
@@ -22,12 +22,13 @@ def far_from_origin(scene: Scene) -> np.ndarray | None:
     were read as far-away numbers of single precision have lost their digits before.
     """
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    boxes: dict[int, np.ndarray] = {}  # Many shapes may share one large mesh.
     for shape in scene.shapes:
-        points = shape.mesh.positions[np.isfinite(shape.mesh.positions).all(axis=1)]
-        if not len(points):
+        if id(shape.mesh) not in boxes:
+            boxes[id(shape.mesh)] = _box_corners(shape.mesh)
+        corners = boxes[id(shape.mesh)]
+        if not len(corners):
             continue
-        box = np.stack([points.min(axis=0), points.max(axis=0)]).astype(np.float64)
-        corners = np.array(list(itertools.product(*box.T)))
         with np.errstate(all="ignore"):
             world = corners @ shape.transform[:3, :3].T + shape.transform[:3, 3]
         if np.isfinite(world).all():
@@ -36,6 +37,15 @@ def far_from_origin(scene: Scene) -> np.ndarray | None:
         return None
     middle, radius = (low + high) / 2.0, float(np.linalg.norm(high - low)) / 2.0
     return middle if np.linalg.norm(middle) > FAR * radius > 0.0 else None
+
+
+def _box_corners(mesh: Mesh) -> np.ndarray:
+    """Return the corners of the box around the finite vertices, ``(8, 3)``, or ``(0, 3)``."""
+    points = mesh.positions[np.isfinite(mesh.positions).all(axis=1)]
+    if not len(points):
+        return np.zeros((0, 3))
+    box = np.stack([points.min(axis=0), points.max(axis=0)]).astype(np.float64)
+    return np.array(list(itertools.product(*box.T)))
 
 
 def moved(scene: Scene, by: np.ndarray) -> Scene:

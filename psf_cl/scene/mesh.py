@@ -14,7 +14,7 @@ import struct
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -29,7 +29,9 @@ SUFFIXES = (".obj", ".ply", ".stl")
 # What trimesh 5.2 lets out for malformed files: text that is no number (ValueError, and
 # DeprecationWarning made an error below), missing columns and indices out of range (IndexError),
 # unknown property types and names (KeyError, UnboundLocalError), absent data (TypeError,
-# AttributeError), and counts that no memory holds (OverflowError, MemoryError).
+# AttributeError), counts that no memory holds (OverflowError, MemoryError), and headers that are
+# no Python literals (SyntaxError, RecursionError).  Ragged lists come out as they are, and NumPy
+# refuses them when they become arrays (TypeError, ValueError).
 _READER_ERRORS = (
     ValueError,
     DeprecationWarning,
@@ -40,8 +42,12 @@ _READER_ERRORS = (
     AttributeError,
     OverflowError,
     MemoryError,
+    SyntaxError,
+    RecursionError,
     struct.error,
 )
+
+Found = TypeVar("Found")
 
 
 def load_mesh_scene(path: Path) -> Scene:
@@ -108,7 +114,7 @@ def _decoded(data: bytes) -> str:
         return data.decode("latin-1")
 
 
-def _guarded(path: Path, name: str, read: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def _guarded(path: Path, name: str, read: Callable[[], Found]) -> Found:
     """Return what ``read`` returns; what it raises becomes an InputError."""
     try:
         with warnings.catch_warnings():
@@ -123,6 +129,10 @@ def _guarded(path: Path, name: str, read: Callable[[], dict[str, Any]]) -> dict[
 
 def _checked_mesh(path: Path, name: str, part: dict[str, Any]) -> Mesh | None:
     """Return trimesh's raw arrays as a mesh with every index checked; None if it has no faces."""
+    return _guarded(path, path.suffix[1:].upper(), lambda: _mesh_of(path, name, part))
+
+
+def _mesh_of(path: Path, name: str, part: dict[str, Any]) -> Mesh | None:
     faces = part.get("faces")
     if faces is None or np.size(faces) == 0:
         return None

@@ -27,6 +27,7 @@ def plan(context: Context) -> StageSpec:
         "every hit and miss is shaded",
         "shade.cl",
         flags=(
+            "INSTANCES",
             "TEXTURES",
             "SMOOTH",
             "GLOSSY",
@@ -67,6 +68,8 @@ def _kernel(context: Context) -> KernelSpec:
     chosen = ("light_normal",) if context.on("LIGHT_SAMPLING") else ()
     walk = ("status", "direction", "beta", "radiance", "pdf", *direct, *base, *shared, *chosen)
     records = [layout.SURFACE, layout.MATERIAL]
+    if context.on("INSTANCES"):
+        records.append(layout.INSTANCE)
     if context.on("SMOOTH"):
         records.append(layout.NORMALS)
     if context.on("TEXTURES"):

@@ -131,6 +131,7 @@ class Context:
     texel_count: int = 1
     environment_count: int = 0
     triangle_count: int = 0
+    instance_count: int = 0
     corner_count: int = 0
     material_count: int = 0
     texture_count: int = 0
