@@ -68,9 +68,10 @@ def small(device):
 def test_a_resumed_render_has_the_bits_of_one_that_never_stopped(small, tmp_path, preset):
     """Of every preset, whatever tables it carries from pass to pass."""
     path = tmp_path / "state"
+    outputs = () if PRESETS[preset].get("integrator") == "metropolis" else OUTPUTS
 
     def fresh():
-        return renderer(small, scene(), OUTPUTS, **PRESETS[preset])
+        return renderer(small, scene(), outputs, **PRESETS[preset])
 
     with contextlib.closing(fresh()) as whole:
         whole.render(spp=SPP)

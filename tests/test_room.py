@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scene_builder import build, camera, floor, glowing, renderer
@@ -126,3 +128,16 @@ def test_memory_is_limited_by_an_option(tmp_path, monkeypatch, capsys):
     assert error.startswith("psf-cl: error: the render needs ") and "1 are there" in error
     assert main("plan a.toml --memory 5000".split()) == 0
     assert main("plan a.toml --memory 0".split()) == 2
+
+
+def test_guards_tell_of_kernels_that_write_behind_a_buffer(device, monkeypatch):
+    monkeypatch.setenv("PSF_CL_GUARDS", "1")
+    guarded = Device(device.context, device.traits)
+    fine, written = (guarded.allocate(name, np.uint32, 3) for name in ("fine", "written"))
+    guarded.fill(fine, 1)
+    behind = dataclasses.replace(written, count=4)
+    guarded.write(behind, np.full(4, 7, np.uint32))
+    guarded.release(fine)
+    with pytest.raises(DeviceError, match="a kernel wrote behind the end of written"):
+        guarded.release(written)
+    assert guarded.allocated_bytes == 0

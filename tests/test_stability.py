@@ -97,11 +97,17 @@ def test_roulette_does_not_take_the_step_into_glass_for_a_loss(device):
 
 def test_all_pairs_of_values_meet_in_some_row(tool):
     values = {"a": [1, 2, 3], "b": ["x", "y"], "c": [False, True], "d": [0.5], "e": list(range(7))}
-    rows = tool.pairwise_rows(values)
-    assert len(rows) < 3 * 2 * 2 * 7  # Far fewer than all combinations.
-    for one, other in itertools.combinations(values, 2):
-        met = {(row[one], row[other]) for row in rows}
-        assert met == set(itertools.product(values[one], values[other]))
+
+    def refusal(row):
+        return "no" if row["a"] == 3 and row["b"] == "y" else None
+
+    for rows, refused in (tool.pairwise_rows(values), tool.pairwise_rows(values, refusal)):
+        assert len(rows) < 3 * 2 * 2 * 7 / 2  # Far fewer than all combinations.
+        for one, other in itertools.combinations(values, 2):
+            met = {(row[one], row[other]) for row in rows}
+            impossible = {(3, "y")} if refused and (one, other) == ("a", "b") else set()
+            assert met == set(itertools.product(values[one], values[other])) - impossible
+    assert refused == ["no"]
 
 
 def test_a_table_without_a_case_or_a_column_is_not_whole(tool):

@@ -22,7 +22,7 @@ import itertools
 import math
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ from psf_cl.device.device import Device, open_device
 from psf_cl.errors import DeviceError, InputError
 from psf_cl.files import write_whole
 from psf_cl.image import Image
+from psf_cl.plan import make_plan
 from psf_cl.renderer import Renderer
 from psf_cl.scene.model import LUMINANCE, Scene
 from psf_cl.settings import PRESETS, Settings, resolve
@@ -46,8 +47,10 @@ SPP = 64
 
 #: Of the mean, beside three standard errors.
 UNBIASED, BIASED = 0.002, 0.02
-MOST_TIME = 2.0
 MOST_SECONDS = 120.0
+
+#: Renders from whose means the error of an estimator is known whose samples belong to no pixel.
+SEEDS = 8
 
 #: Processor time below which a ratio says nothing.
 LEAST_SECONDS = 0.2
@@ -114,13 +117,38 @@ def is_biased(settings: Settings) -> bool:
 
 
 def picture(device: Device, scene: Scene, settings: Settings, spp: int) -> Picture:
-    """Render and sum up.
+    """Render and sum up; where samples belong to no pixel, in parts that differ by their noise.
 
     Raises:
         TooSlowError: it did not end in time.
         DeviceError, InputError: as the renderer does.
     """
-    with contextlib.closing(Renderer(scene, settings, device, outputs=("variance",))) as renderer:
+    if settings.integrator != "metropolis":
+        return part_of(device, scene, settings, spp, ("variance",))
+    seeds = range(settings.seed, settings.seed + SEEDS)
+    part_spp = max(spp // SEEDS, 1)
+    parts = [
+        part_of(device, scene, dataclasses.replace(settings, seed=seed % 2**32), part_spp)
+        for seed in seeds
+    ]
+    means = [part.mean for part in parts]
+    return dataclasses.replace(
+        parts[0],
+        bad=sum(part.bad for part in parts),
+        rejected=sum(part.rejected for part in parts),
+        mean=float(np.mean(means)),
+        error=float(np.std(means, ddof=1)) / math.sqrt(SEEDS),
+        largest=max(part.largest for part in parts),
+        samples=sum(part.samples for part in parts),
+        seconds=sum(part.seconds for part in parts),
+    )
+
+
+def part_of(
+    device: Device, scene: Scene, settings: Settings, spp: int, outputs: tuple[str, ...] = ()
+) -> Picture:
+    """Render once and sum up; errors are those of ``picture``."""
+    with contextlib.closing(Renderer(scene, settings, device, outputs=outputs)) as renderer:
         begin, start = time.perf_counter(), time.process_time()
         if not renderer.render(
             spp=spp, progress=lambda now: time.perf_counter() - begin < MOST_SECONDS
@@ -136,7 +164,9 @@ def summed_up(image: Image, seconds: float) -> Picture:
     rgb = image.rgb.astype(np.float64)
     luminance = rgb @ LUMINANCE
     finite = np.isfinite(rgb).all(axis=-1)
-    variance = float(image.aovs["variance"].astype(np.float64).mean())
+    variance = (
+        float(np.mean(image.aovs["variance"].astype(float))) if "variance" in image.aovs else 0.0
+    )
     stats = image.stats
     counters = {
         name: value for name, value in stats["counters"].items() if name != "rejected_samples"
@@ -208,7 +238,7 @@ class Bench:
             f"{seen.rejected} samples rejected": seen.rejected > 0,
             "the mean is off": not abs(seen.mean - truth) <= allowed,
             "a pixel is too bright": not seen.largest <= most + allowed,
-            "it is too slow": ratio is not None and ratio > MOST_TIME,
+            "it is too slow": ratio is not None and ratio > case.most_time,
         }
         why = "; ".join(text for text, failed in failures.items() if failed)
         return row | {
@@ -239,7 +269,7 @@ class Bench:
             )
         best = seen
         for _ in range(2):
-            if best.ns <= MOST_TIME * self.calm[key].ns or best.seconds > 10.0:
+            if best.ns <= case.most_time * self.calm[key].ns or best.seconds > 10.0:
                 break
             best = min(best, self.render(case, preset), key=lambda one: one.ns)
             self.calm[key] = max(self.calm[key], self.render(calm, preset), key=lambda one: one.ns)
@@ -248,27 +278,28 @@ class Bench:
         return best.ns / self.calm[key].ns, seen
 
     def pairs(self) -> dict[str, Any]:
-        """Return the row of all pairs of values of the settings, refused ones included."""
-        scene, refused, failures, bad, rejected = room(16), 0, [], 0, 0
-        largest = 0.0
-        rows = pairwise_rows(setting_values())
+        """Return the row of all pairs of values of the settings."""
+        scene, failures, bad, rejected, largest = room(16), [], 0, 0, 0.0
+
+        def refusal(values: Mapping[str, Any]) -> str | None:
+            try:
+                make_plan(scene, Settings().with_values(values), traits=self.device.traits)
+            except InputError as error:
+                return str(error)
+            return None
+
+        rows, refused = pairwise_rows(setting_values(), refusal)
+        failures += [f"refused in more than a line: {text}" for text in refused if "\n" in text]
         for values in rows:
             try:
-                settings = Settings().with_values(values)
-            except InputError as error:
-                refused += 1
-                if "\n" in str(error):
-                    failures.append(f"{values}: refused in more than a line")
-                continue
-            try:
-                seen = picture(self.device, scene, settings, 4)
+                seen = part_of(self.device, scene, Settings().with_values(values), 4)
             except (TooSlowError, DeviceError, InputError) as error:
-                failures.append(f"{values}: {error}")
+                failures.append(f"{changed(values)}: {error}")
                 continue
+            if seen.bad or seen.rejected:
+                failures.append(f"{changed(values)}: not finite")
             bad, rejected = bad + seen.bad, rejected + seen.rejected
             largest = max(largest, seen.largest)
-        if bad or rejected:
-            failures.append(f"{bad} pixels are not finite, {rejected} samples rejected")
         return dict.fromkeys(COLUMNS, "") | {
             "case": PAIRS,
             "preset": "all",
@@ -277,51 +308,86 @@ class Bench:
             "not finite": bad,
             "rejected": rejected,
             "largest": largest,
-            "counters": f"rows={len(rows)} refused={refused}",
+            "counters": f"rows={len(rows)} refused={len(refused)}",
         }
 
 
+def changed(values: Mapping[str, Any]) -> str:
+    """Return settings that are not the default, as ``--set`` takes them."""
+    default = Settings()
+    return " ".join(f"{k}={v}" for k, v in values.items() if v != getattr(default, k))
+
+
 def setting_values() -> dict[str, list[Any]]:
-    """Return values of every setting: all choices; of numbers the ends of the range and between."""
+    """Return values of every setting, the default first: choices, and the ends of ranges."""
     values: dict[str, list[Any]] = {}
     for item in dataclasses.fields(Settings):
-        if "choices" in item.metadata:
-            values[item.name] = list(item.metadata["choices"])
-        elif item.metadata.get("switch"):
-            values[item.name] = [False, True]
-        else:
-            low, high = item.metadata["range"]
-            values[item.name] = list(dict.fromkeys([item.default, low, high]))
+        others: Sequence[Any] = item.metadata.get("choices") or item.metadata.get("range") or ()
+        if item.metadata.get("switch"):
+            others = (False, True)
+        values[item.name] = list(dict.fromkeys([item.default, *others]))
     return values
 
 
-def pairwise_rows(values: Mapping[str, Sequence[Any]], seed: int = 1) -> list[dict[str, Any]]:
+def pairwise_rows(
+    values: Mapping[str, Sequence[Any]],
+    refusal: Callable[[Mapping[str, Any]], str | None] = lambda row: None,
+    seed: int = 1,
+) -> tuple[list[dict[str, Any]], list[str]]:
     """Return combinations such that any two values of two settings meet in one of them.
 
     Greedy: of some random candidates that contain a pair still missing, the one with most of them.
     Source: Cohen, Dalal, Fredman, Patton: The AETG System, IEEE Trans. Software Eng. 23 (7), 1997.
+
+    Args:
+        values: of each setting, the default first.
+        refusal: why a combination is impossible, or None.
+
+    Returns:
+        the combinations; and why those pairs were refused that are impossible by themselves.
     """
     names = list(values)
+    counts = [len(values[name]) for name in names]
+
+    def row(pick: Sequence[int]) -> dict[str, Any]:
+        return {name: values[name][k] for name, k in zip(names, pick, strict=True)}
+
+    def pairs_of(pick: Sequence[int]) -> set[tuple[int, ...]]:
+        places = itertools.combinations(range(len(names)), 2)
+        return {(a, pick[a], b, pick[b]) for a, b in places}
+
+    def alone(pair: tuple[int, ...]) -> list[int]:
+        pick = [0] * len(names)
+        pick[pair[0]], pick[pair[2]] = pair[1], pair[3]
+        return pick
+
     missing = {
         (a, i, b, j)
         for a, b in itertools.combinations(range(len(names)), 2)
-        for i in range(len(values[names[a]]))
-        for j in range(len(values[names[b]]))
+        for i in range(counts[a])
+        for j in range(counts[b])
     }
+    reasons = {pair: refusal(row(alone(pair))) for pair in missing}
+    refused = [text for text in reasons.values() if text is not None]
+    missing = {pair for pair in missing if reasons[pair] is None}
     chance, rows = np.random.default_rng(seed), []
     while missing:
-        best: tuple[set[tuple[int, ...]], list[int]] = (set(), [])
-        a, i, b, j = min(missing)
+        pair = min(missing)
+        best = alone(pair)
         for _ in range(20):
-            pick = [int(chance.integers(len(values[name]))) for name in names]
-            pick[a], pick[b] = i, j
-            met = {
-                (x, pick[x], y, pick[y]) for x, y in itertools.combinations(range(len(names)), 2)
-            } & missing
-            best = max(best, (met, pick), key=lambda candidate: len(candidate[0]))
-        missing -= best[0]
-        rows.append({name: values[name][k] for name, k in zip(names, best[1], strict=True)})
-    return rows
+            pick = [int(chance.integers(count)) for count in counts]
+            pick[pair[0]], pick[pair[2]] = pair[1], pair[3]
+            # What does not go together gives way to the default, one setting after another.
+            for place in chance.permutation(len(names)):
+                if refusal(row(pick)) is None:
+                    break
+                if place not in (pair[0], pair[2]):
+                    pick[place] = 0
+            if refusal(row(pick)) is None:
+                best = max(best, pick, key=lambda one: len(pairs_of(one) & missing))
+        missing -= pairs_of(best)
+        rows.append(row(best))
+    return rows, refused
 
 
 def missing_rows(rows: Sequence[Mapping[str, Any]], wanted: Sequence[tuple[str, str]]) -> list[str]:

@@ -26,7 +26,7 @@ typedef JOIN(int, W) Mask;
 // lanes make a CPU likely: other compilers may not know what to do with the builtin.
 #define ANY(mask) any(mask)
 #ifdef __has_builtin
-#if W > 1 && __has_builtin(__builtin_reduce_or)
+#if W > 1 && !defined(PLAIN_C) && __has_builtin(__builtin_reduce_or)
 #define REDUCE_OR(mask) __builtin_reduce_or(mask)
 #undef ANY
 #define ANY(mask) (REDUCE_OR(mask) != 0)

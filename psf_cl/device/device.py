@@ -21,6 +21,13 @@ if TYPE_CHECKING:
     from psf_cl.device.program import Program
 
 
+#: Environment variable: 1 puts bytes behind every buffer that no kernel may change.
+GUARD_VARIABLE = "PSF_CL_GUARDS"
+_GUARD_BYTES = 4096
+# As a float it is not a number: reading behind an end shows in the image.
+_GUARD = 0xFF
+
+
 @dataclass(frozen=True)
 class Buffer:
     """Device memory with the type of its items.
@@ -62,6 +69,7 @@ class Device:
         self.profiling = profiling
         flags = cl.command_queue_properties.PROFILING_ENABLE if profiling else 0
         self.queue = cl.CommandQueue(self.context, properties=flags)
+        self.guard_bytes = _GUARD_BYTES if os.environ.get(GUARD_VARIABLE) == "1" else 0
         self.allocated_bytes = 0
         self.peak_bytes = 0
         self.programs: dict[tuple[Any, ...], Program] = {}
@@ -103,9 +111,13 @@ class Device:
             )
         try:
             with self.failures(f"allocating {size / 2**20:.0f} MiB for {name}"):
-                memory = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, size)
+                memory = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, size + self.guard_bytes)
                 # A pattern of one byte divides every size.
                 event = cl.enqueue_fill_buffer(self.queue, memory, np.uint8(0), 0, size)
+                if self.guard_bytes:
+                    cl.enqueue_fill_buffer(
+                        self.queue, memory, np.uint8(_GUARD), size, self.guard_bytes
+                    )
         except DeviceError as error:
             raise NoRoomError(str(error)) from error
         self.note_event(TRANSFER, f"clear {name}", size, event)
@@ -158,10 +170,25 @@ class Device:
         self.note_event(TRANSFER, f"fill {buffer.name}", buffer.bytes, event)
 
     def release(self, *buffers: Buffer) -> None:
-        """Give buffers back; using one afterwards is an error."""
+        """Give buffers back; using one afterwards is an error.
+
+        Raises:
+            DeviceError: guards are on, and what lies behind a buffer was changed.
+        """
+        broken = [buffer.name for buffer in buffers if not self._guard_is_whole(buffer)]
         for buffer in buffers:
             self.allocated_bytes -= buffer.bytes
             buffer.release()
+        if broken:
+            raise DeviceError(f"a kernel wrote behind the end of {', '.join(broken)}")
+
+    def _guard_is_whole(self, buffer: Buffer) -> bool:
+        if not self.guard_bytes:
+            return True
+        guard = np.empty(self.guard_bytes, np.uint8)
+        with self.failures(f"reading behind {buffer.name}"):
+            cl.enqueue_copy(self.queue, guard, buffer.memory, src_offset=buffer.bytes)
+        return bool((guard == _GUARD).all())
 
     def wait(self) -> None:
         """Wait for everything queued.

@@ -19,8 +19,11 @@ def far_from_origin(scene: Scene) -> np.ndarray | None:
     """Return the middle of a scene that is far away from the origin, ``(3,)`` float64, else None.
 
     Transforms are double precision, so that a scene loses nothing by being moved; vertices that
-    were read as far-away numbers of single precision have lost their digits before.
+    were read as far-away numbers of single precision have lost their digits before.  Scenes that
+    move stay where they are, for each frame places anew what moves.
     """
+    if scene.nodes:
+        return None
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     boxes: dict[int, np.ndarray] = {}  # Many shapes may share one large mesh.
     for shape in scene.shapes:
