@@ -51,7 +51,7 @@ class Settings:
         doc="independent paths, or chains of paths, each a mutation of the one before",
     )
     chains: int = _number(
-        8192, 128, 1 << 22, doc="chains of metropolis, side by side, rounded up to whole blocks"
+        2048, 128, 1 << 22, doc="chains of metropolis, side by side, rounded up to whole blocks"
     )
     large_steps: float = _number(
         0.3, 0.01, 1.0, doc="share of the paths of metropolis that are independent of their chain"

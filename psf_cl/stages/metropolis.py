@@ -14,7 +14,7 @@ from psf_cl.stages.spec import POOL_FLAGS, BufferSpec, Context, KernelSpec, Stag
 from psf_cl.traits import DeviceTraits
 
 #: Independent paths before the first pass: they give the mean brightness and the first states.
-CANDIDATES = 1 << 17
+CANDIDATES = 1 << 16
 
 #: Vertices of a path whose random numbers a chain keeps; deeper ones get new numbers every time.
 KEPT_VERTICES = 24
@@ -22,8 +22,8 @@ KEPT_VERTICES = 24
 #: Mutations of a chain that fit into the passes in flight: chains of long paths are slower.
 MUTATIONS_IN_FLIGHT = 64
 
-#: Mutations of a chain in the shortest epoch: its end costs about ten.
-MUTATIONS_PER_EPOCH = 128
+#: Mutations of a chain in the shortest epoch, at whose end the fast chains wait for the slow ones.
+MUTATIONS_PER_EPOCH = 512
 
 #: Steps of a splat of mean brightness: sums seldom need their high words, and nothing shows.
 MOST_STEPS = 2.0**24
