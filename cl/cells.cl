@@ -208,7 +208,7 @@ static inline float4 base_share_of(__global const Beyond *beyond, __global const
 {
 #if BASE == 2
     if ((beyond[sample].vertex & VERTEX_MASK) > 1u)
-        return vload4(0, seen[sample].share);
+        return (float4)(vload3(0, seen[sample].share), 0.0f);
 #endif
     return (float4)(1.0f);
 }

@@ -4,10 +4,12 @@
 // After N. Binder, A. Keller: Ray-Traced Global Illumination for Games: Massively Parallel Path Space
 // Filtering, GTC 2019.
 
+#include "common/features.h"
 #include "common/lanes.h"
 #include "common/layout.h"
 #include "common/pixels.h"
 #include "common/rng.h"
+#include "common/view.h"
 
 // Normals whose cosine is below are those of different surfaces.
 #define LEAST_COSINE 0.9f
@@ -27,6 +29,7 @@ kernel void resolve_light(
         return;
     const float count = (float)max(film[pixel].count, 1u);
     light[pixel].count = (float)film[pixel].count;
+    light[pixel].alpha = 1.0f;
     for (uint c = 0; c < 3; ++c) {
         light[pixel].rgb[c] = (film[pixel].sum[c] - film[pixel].lost[c]) / count;
         light[pixel].base[c] = (film_base[pixel].sum[c] - film_base[pixel].lost[c]) / count;
@@ -75,9 +78,7 @@ kernel void filter_screen(
     UInt y;
     pixel_place(params, pixel, &x, &y);
     const Surroundings here = seen_at(surfaces_seen, pixel);
-    const Vec3 eye = vec3_of(params->camera_origin);
-    const Vec3 away = sub(here.p, eye);
-    const Float footprint = sqrt(dot3(away, away)) * (2.0f * params->film_scale_y / (float)params->height);
+    const Float footprint = footprint_at(params, view_of(params), here.p);
     const Float own = GATHER(light, pixel, count);
     const Float radius = params->screen_radius * exp2(-0.25f * log2(max(own, 1.0f)));
     const Float reach = 2.0f * radius * footprint;

@@ -27,7 +27,7 @@ static inline Float emission_weight(__global const Params *params, Mask camera_r
 }
 
 #if SEEN
-/// Hand in the first surface; nothing where `hit` is not set.
+/// Hand in the first surface; nothing where `hit` is not set.  `shape` and `before` as in Seen.
 LARGE_FUNCTION void store_seen(
     __global const Params *params,
     __global Seen *seen,
@@ -35,31 +35,36 @@ LARGE_FUNCTION void store_seen(
     Mask hit,
     UInt sample,
     UInt pixel,
+    UInt shape,
     Vec3 p,
+    Vec3 before,
     Vec3 ns,
     Vec3 gate)
 {
     const Vec3 zero = vec3_all((Float)(0.0f));
     const Vec3 place = pick_v(hit, p, zero);
+    const Vec3 place_before = pick_v(hit, before, zero);
     const Vec3 factor = pick_v(hit, gate, zero);
-    const Float values[9] = {place.x, place.y, place.z, ns.x, ns.y, ns.z, factor.x, factor.y, factor.z};
-    float lane_value[9][W];
-    uint lane_hit[W];
+    const Float values[12] = {place.x,  place.y,  place.z,  ns.x,           ns.y,           ns.z,
+                              factor.x, factor.y, factor.z, place_before.x, place_before.y, place_before.z};
+    float lane_value[12][W];
+    uint lane_shape[W];
     uint lane_sample[W];
     uint lane_pixel[W];
-    for (uint c = 0; c < 9; ++c)
+    for (uint c = 0; c < 12; ++c)
         store_lanes(values[c], lane_value[c]);
-    store_lanes_u(pick_u(hit, (UInt)(1u), (UInt)(0u)), lane_hit);
+    store_lanes_u(pick_u(hit, shape, (UInt)(0u)), lane_shape);
     store_lanes_u(sample & (params->ring - 1u), lane_sample);
     store_lanes_u(pixel, lane_pixel);
     for (uint left = lane_bits(mask); left; left &= left - 1u) {
         const uint k = lowest_bit(left);
         const ulong at = (ulong)lane_sample[k] * params->pixel_count + lane_pixel[k];
         __global float *words = (__global float *)(seen + at);
-        vstore8((float8)(lane_value[0][k], lane_value[1][k], lane_value[2][k], as_float(lane_hit[k]),
-                         lane_value[3][k], lane_value[4][k], lane_value[5][k], 0.0f),
-                0, words);
-        vstore4((float4)(lane_value[6][k], lane_value[7][k], lane_value[8][k], 0.0f), 2, words);
+        vstore16((float16)(lane_value[0][k], lane_value[1][k], lane_value[2][k], as_float(lane_shape[k]),
+                           lane_value[3][k], lane_value[4][k], lane_value[5][k], lane_value[6][k],
+                           lane_value[7][k], lane_value[8][k], 0.0f, 0.0f,
+                           0.0f, lane_value[9][k], lane_value[10][k], lane_value[11][k]),
+                 0, words);
     }
 }
 #endif
@@ -80,8 +85,7 @@ static inline void store_base_share(
     for (uint left = lane_bits(mask); left; left &= left - 1u) {
         const uint k = lowest_bit(left);
         const ulong at = (ulong)lane_sample[k] * params->pixel_count + lane_pixel[k];
-        vstore4((float4)(lane_share[0][k], lane_share[1][k], lane_share[2][k], 0.0f), 3,
-                (__global float *)(seen + at));
+        vstore3((float3)(lane_share[0][k], lane_share[1][k], lane_share[2][k]), 0, seen[at].share);
     }
 }
 #endif
@@ -304,6 +308,8 @@ kernel void shade_paths(
 
     const Mask goes_on = hit & (depth < params->max_depth);
 #if SEEN
+    const UInt shape = 1u + GATHER_U(surfaces, triangle, shape);
+    const Vec3 before = s.p;
 #if BASE
     // The others wait for the reflectance of their base.
     const Mask sees = alive & camera_ray & !goes_on;
@@ -311,7 +317,7 @@ kernel void shade_paths(
     const Mask sees = alive & camera_ray;
 #endif
     if (any_lane(sees))
-        store_seen(params, seen, sees, hit, sample, pixel, s.p, s.ns, zero);
+        store_seen(params, seen, sees, hit, sample, pixel, shape, s.p, before, s.ns, zero);
 #endif
     if (!any_lane(goes_on)) {
         put_u(path, PATH_STATUS, pick_u(alive, STATUS_DONE | depth, status));
@@ -338,7 +344,7 @@ kernel void shade_paths(
 #if BASE
     const Mask reflects = goes_on & camera_ray;
     if (any_lane(reflects))
-        store_seen(params, seen, reflects, reflects, sample, pixel, s.p, s.ns, gate);
+        store_seen(params, seen, reflects, reflects, sample, pixel, shape, s.p, before, s.ns, gate);
 #endif
 #if CELLS
     const Mask chosen = goes_on & (vertex == 0u) & (max3(gate) > 0.0f)

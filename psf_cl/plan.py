@@ -37,6 +37,7 @@ from psf_cl.stages import (
     seen,
     shade,
     splats,
+    temporal,
 )
 from psf_cl.stages.spec import BufferSpec, Context, Feature, StageSpec
 from psf_cl.tables import distinct_images, few_triangles, flatten, visible_shapes
@@ -285,6 +286,7 @@ def make_plan(
         splats,
         seen,
         film,
+        temporal,
         screen,
     ):
         stage = module.plan(context)
@@ -369,7 +371,7 @@ def _ring(
     behind them, at least two passes, as far as memory goes.
     """
     planes = 1 + features["AOV_DIRECT"].value + 3 * features["AOV_FEATURES"].value
-    planes += 4 * features["SEEN"].value + bool(features["BASE"].value)
+    planes += 4 * bool(features["SEEN"].value) + bool(features["BASE"].value)
     # With a vertex, what lies behind it, and about one cell: its sums and its key.
     cell_bytes = 16 + 32 + 36 if features["CELLS"].value else 0
     sample_bytes = 16 * planes + cell_bytes
@@ -500,12 +502,11 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "no albedo, normal or depth was asked for",
         ),
         "CELLS": _cells(settings, glossy),
-        "SEEN": switch(
-            settings.screen_filter != "off",
-            "screen_filter compares what pixels see",
-            "screen_filter is off",
-        ),
+        "SEEN": _seen(settings, outputs),
         "BASE": _base(settings, glossy),
+        "TEMPORAL": switch(
+            settings.temporal != "off", f"temporal is {settings.temporal}", "temporal is off"
+        ),
         "METROPOLIS": switch(
             settings.integrator == "metropolis",
             "integrator is metropolis",
@@ -533,6 +534,17 @@ def _cells(settings: Settings, glossy: bool) -> Feature:
     return Feature(1, "path_filter is hash_grid; every material is matt")
 
 
+def _seen(settings: Settings, outputs: frozenset[str]) -> Feature:
+    """Return whether the first surfaces are kept: 2 with where they were in the frame before."""
+    if settings.temporal != "off":
+        return Feature(2, "frames share light where they see the same")
+    if "motion" in outputs:
+        return Feature(2, "motion was asked for")
+    if settings.screen_filter != "off":
+        return Feature(1, "screen_filter compares what pixels see")
+    return Feature(0, "neither screen_filter nor temporal is on, nor motion asked for")
+
+
 def _base(settings: Settings, glossy: bool) -> Feature:
     """Return whether what first surfaces reflect is kept apart, and if so how much of it."""
     if settings.screen_filter == "off":
@@ -547,7 +559,7 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
 
     What is on keeps its value: as an image of one texel a constant sky would be sampled otherwise.
     """
-    most = {"ALPHA": 2, "ENVIRONMENT": 2, "CELLS": 2, "BASE": 2}
+    most = {"ALPHA": 2, "ENVIRONMENT": 2, "CELLS": 2, "BASE": 2, "SEEN": 2}
     full = {
         name: feature
         if feature.value

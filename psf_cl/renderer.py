@@ -7,7 +7,7 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from functools import cached_property, partial
@@ -37,7 +37,7 @@ from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Scene
 from psf_cl.scheduler import Hooks, Progress, Scheduler, doubling_epoch
 from psf_cl.settings import Settings, resolve
-from psf_cl.stages import cells, film, metropolis, screen
+from psf_cl.stages import cells, film, metropolis, screen, temporal
 
 #: Looks of the host at the counters for each count of the paths by depth, which takes 0.4 ms on two
 #: CPU cores; the first look, which is left out, is at a pool that is still empty.
@@ -220,19 +220,42 @@ class Renderer:
         self.device.wait()
         # Of the device: after an interrupt the host has not seen its last passes.
         first = int(self.device.read(self.buffers["counters"])[layout.COUNTER_INDEX["film_pass"]])
+        whole = first > self.scheduler.first
         self.scheduler.begin_frame(first)
         self.scheduler.clock.start()
         try:
+            if whole:
+                self._keep_history()
             self._empty(first)
             values = tables.camera_values(
                 self.scene.cameras[self.scene.camera], self.scene.width, self.scene.height
             )
             before = self.params[0].copy()
             values |= {new: before[name] for new, name in tables.PREVIOUS_CAMERA.items()}
+            values["history_flags"] = self._history_flags(before, values) if whole else 0
             self._set_params(values | {"first_pass": first})
             self.device.wait()
         finally:
             self.scheduler.clock.stop()
+
+    def _keep_history(self) -> None:
+        """Keep the picture of the frame that ends for the next one, if that asks for it."""
+        if self.history_launches:
+            # Not what the screen filter makes of it: light would spread from frame to frame.
+            for launch, items in (*self.blend_launches, *self.history_launches):
+                launch(items, film.GROUP)
+
+    def _history_flags(self, before: np.ndarray, values: Mapping[str, Any]) -> int:
+        """Return what ``Params.history_flags`` say of the frame that begins."""
+        constants = layout.CONSTANT
+        same_view = all(
+            np.array_equal(np.float32(values[name]), before[name])
+            for name in tables.PREVIOUS_CAMERA.values()
+        )
+        flags = constants["HISTORY_THERE"]
+        if same_view:
+            flags |= constants["HISTORY_SAME_VIEW"] | constants["HISTORY_STILL"]
+        return flags
 
     def _empty(self, first: int) -> None:
         """Leave no path in the pool and no sample in the film; ``first`` is the next pass."""
@@ -377,8 +400,8 @@ class Renderer:
         if "film_direct" in sums:
             aovs["direct"] = mean(sums["film_direct"][0])
             aovs["indirect"] = aovs["rgb"] - aovs["direct"]
-        if self.screen_launches and not partial:
-            aovs["rgb"] = self._filtered()
+        if self.picture_launches and not partial:
+            aovs["rgb"] = self._picture()
         if "film_features" in sums:
             aovs["albedo"], aovs["normal"], depth = (mean(plane) for plane in sums["film_features"])
             aovs["depth"] = depth[..., :1]
@@ -389,6 +412,8 @@ class Renderer:
             return image.reshape(height, width, 1)
 
         aovs["samples"] = scalar(main["count"])
+        if names & {"motion", "history", "alpha"}:
+            aovs |= self._temporal_aovs(main["count"], bool(partial))
         count = main["count"].astype(np.float64)
         variance = main["squares"] / np.maximum(count - 1, 1) / np.maximum(count, 1)
         aovs["variance"] = scalar(np.where(count > 1, variance, 0.0))
@@ -401,12 +426,36 @@ class Renderer:
             full_height=self.scene.height,
         )
 
-    def _filtered(self) -> np.ndarray:
-        for launch, items in self.screen_launches:
+    def _picture(self) -> np.ndarray:
+        """Return the image with what is done to it before it is handed out, ``(h, w, 3)``."""
+        for launch, items in self.picture_launches:
             launch(items, film.GROUP)
-        image = np.zeros((self.plan.pixel_count, 3), np.float32)
-        image[self.order] = self.device.read(self.buffers["filtered"]).reshape(-1, 4)[:, :3]
-        return image.reshape(self.plan.crop[3], self.plan.crop[2], 3)
+        if "filtered" in self.buffers:
+            pixels = self.device.read(self.buffers["filtered"]).reshape(-1, 4)[:, :3]
+        else:
+            pixels = self.device.read(self.buffers["light"])["rgb"]
+        return self._in_rows(pixels)
+
+    def _in_rows(self, pixels: np.ndarray) -> np.ndarray:
+        """Return pixels in the order of the queue, ``(n, c)``, as ``(h, w, c)`` float32."""
+        image = np.zeros(pixels.shape, np.float32)
+        image[self.order] = pixels
+        return image.reshape(self.plan.crop[3], self.plan.crop[2], -1)
+
+    def _temporal_aovs(self, count: np.ndarray, partial: bool) -> dict[str, np.ndarray]:
+        """Return what frames say of one another; ``count`` are the samples of this one."""
+        aovs = {"history": count, "alpha": np.ones_like(count)}
+        if self.plan.features["TEMPORAL"].value and not partial:
+            light = self.device.read(self.buffers["light"])
+            aovs = {"history": light["count"], "alpha": light["alpha"]}
+        if "motion" in self.buffers:
+            for launch, items in self.motion_launches:
+                launch(items, film.GROUP)
+            aovs["motion"] = self.device.read(self.buffers["motion"])
+        return {
+            name: self._in_rows(values.reshape(self.plan.pixel_count, -1))
+            for name, values in aovs.items()
+        }
 
     def save(self, path: str | os.PathLike[str]) -> bool:
         """Write a checkpoint, if this is a moment for one.
@@ -673,6 +722,7 @@ class Renderer:
         values |= cells.parameters(scene, settings, self.plan.pixel_count)
         values |= screen.parameters(settings)
         values |= metropolis.parameters(settings, self.plan.traits.slots, self.plan.pixel_count)
+        values |= temporal.parameters(settings)
         for name, value in values.items():
             params[0][name] = value
         return params
@@ -761,7 +811,7 @@ class Renderer:
         self.add_seen = (
             programs["seen"].bind_planned("add_seen", self.buffers) if "seen" in programs else None
         )
-        self.screen_launches = self._per_pixel_launches(programs, "screen")
+        self._bind_pictures(programs)
         self.advance = self.film_program.bind_planned("advance_film", self.buffers)
         if self.statistics:
             self.census = self.film_program.bind(
@@ -772,20 +822,29 @@ class Renderer:
                 bins=film.CENSUS_BINS,
             )
 
-    def _per_pixel_launches(
-        self, programs: dict[str, Program], name: str
-    ) -> list[tuple[Launch, int]]:
-        """Return the launches of a stage that works on pixels, with their work items."""
-        traits, pixels = self.plan.traits, self.plan.pixel_count
-        return [
-            (
-                programs[name].bind_planned(kernel.name, self.buffers),
-                -(-pixels // kernel.paths_per_item(traits)),
-            )
-            for stage in self.plan.stages
-            if stage.name == name
-            for kernel in stage.kernels
-        ]
+    def _bind_pictures(self, programs: dict[str, Program]) -> None:
+        """Bind what makes the picture of sums and history, and the history of the picture."""
+
+        def launches(*names: str) -> list[tuple[Launch, int]]:
+            traits, pixels = self.plan.traits, self.plan.pixel_count
+            return [
+                (
+                    programs[stage.name].bind_planned(name, self.buffers),
+                    -(-pixels // kernel.paths_per_item(traits)),
+                )
+                for name in names
+                for stage in self.plan.stages
+                for kernel in stage.kernels
+                if kernel.name == name
+            ]
+
+        shared = bool(self.plan.features["TEMPORAL"].value)
+        self.motion_launches = launches("find_motion")
+        self.history_launches = launches("keep_history")
+        self.blend_launches = (
+            launches("find_motion", "blend_history") if shared else launches("resolve_light")
+        )
+        self.picture_launches = [*self.blend_launches, *launches("filter_screen")]
 
     def _bind_cells(self, program: Program | None) -> None:
         self.cell_launches: list[tuple[Launch, int]] = []

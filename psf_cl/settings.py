@@ -26,6 +26,9 @@ AOVS = {
     "indirect": "all other light: rgb = direct + indirect",
     "variance": "of the pixel's mean, estimated from its samples",
     "samples": "samples of the pixel",
+    "motion": "pixels that what is seen has moved since the frame before: right, down",
+    "history": "samples that the pixel is worth, with those of the frames before",
+    "alpha": "weight of this frame in it",
 }
 
 
@@ -106,6 +109,16 @@ class Settings:
         12.0, 0.0, 1e4, doc="how far these are, pixels, for one sample; count^(-1/4) of it for more"
     )
     screen_neighbours: int = _number(24, 1, 256, doc="how many of them are asked")
+    temporal: str = _choice(
+        "off",
+        "exponential",
+        "cumulative",
+        "adaptive",
+        doc="share light between the frames of a sequence, and by which rule",
+    )
+    temporal_alpha: float = _number(
+        0.2, 1e-6, 1.0, doc="weight of the newest frame by the exponential rule"
+    )
     seed: int = _number(0, 0, 0xFFFFFFFF, doc="start of every random sequence")
 
     def __post_init__(self) -> None:
@@ -175,7 +188,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 #: What goes with ``integrator=metropolis``: it has no pixel's samples to share, guide or keep.
-METROPOLIS_NEEDS = {"path_filter": "off", "screen_filter": "off"}
+METROPOLIS_NEEDS = {"path_filter": "off", "screen_filter": "off", "temporal": "off"}
 
 
 def check_together(settings: Settings) -> None:

@@ -95,7 +95,7 @@ def flatten(scene: Scene) -> Geometry:
     mapped = any(shape.mesh.uvs is not None or shape.mesh.uvs1 is not None for shape in shapes)
     colored = any(shape.mesh.colors is not None for shape in shapes)
     directed = any(has_tangents(scene.materials[shape.material]) for shape in shapes)
-    for shape in shapes:
+    for number, shape in enumerate(shapes):
         mesh, material = shape.mesh, scene.materials[shape.material]
         linear = shape.transform[:3, :3]
         with np.errstate(
@@ -109,6 +109,7 @@ def flatten(scene: Scene) -> Geometry:
             surface["e2"] = corners[:, 2] - corners[:, 0]
             determinant = np.linalg.det(linear)
         surface["material"] = shape.material
+        surface["shape"] = number
         surface["light"] = layout.CONSTANT["NO_LIGHT"]
         surface["ng"] = _front_normals(surface, mirrored=determinant < 0)
         surface["offset"] = OFFSET_EPSILON * _extent(surface)

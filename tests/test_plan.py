@@ -252,6 +252,7 @@ def test_every_flag_at_once_renders(wants):
         AOVS,
         path_filter="hash_grid",
         screen_filter="path_space",
+        temporal="adaptive",
         light_sampling="hierarchy",
     )
     # Chains of paths would leave out what samples of pixels are for, places the list of triangles.

@@ -105,7 +105,7 @@ def filtered(opened, light, seen):
     device, order = opened.device, opened.order
     device.write(opened.buffers["light"], light.reshape(-1)[order])
     device.write(opened.buffers["surfaces_seen"], seen.reshape(-1)[order])
-    launch, items = opened.screen_launches[-1]
+    launch, items = opened.picture_launches[-1]
     assert launch.name == "filter_screen"
     launch(items)
     picture = np.zeros((light.size, 4), np.float32)
@@ -133,7 +133,7 @@ def surfaces(opened, heights):
     seen = np.zeros((height, width), layout.SEEN_MEAN.dtype)
     seen["p"] = view[:3, 3] + to * away[..., None]
     seen["ns"] = view[:3, 2]
-    seen["hits"] = seen["count"] = 1
+    seen["hits"] = seen["count"] = seen["shape"] = 1
     seen["gate"] = rng.random((height, width, 3)) ** 2
     light = np.zeros((height, width), layout.PIXEL_LIGHT.dtype)
     light["base"] = seen["gate"]

@@ -53,7 +53,10 @@
 #error "AOV_FEATURES must be 0 or 1"
 #endif
 #ifndef SEEN
-#error "SEEN must be 0 or 1 (the first surface is kept)"
+#error "SEEN must be 0, 1 (the first surface is kept) or 2 (and where it was)"
+#endif
+#ifndef TEMPORAL
+#error "TEMPORAL must be 0, 1 (frames share light) or 2 (and look for changes)"
 #endif
 #ifndef BASE
 #error "BASE must be 0, 1 (what the first surface reflects is kept apart) or 2 (only what its base reflects)"

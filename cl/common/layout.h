@@ -45,6 +45,14 @@
 #define CELL_JITTER 1u // points are moved before they are told apart by cells
 #define CELL_NEAR 4u // samples of light from near have cells of their own
 #define CELL_IDENTITY 2u // every sample has a cell of its own: nothing is shared (tests)
+#define SHAPE_MOVES 0x80000000u // its triangles move between frames
+#define RULE_OFF 0u // frames know nothing of one another
+#define RULE_EXPONENTIAL 1u // a frame has a constant weight
+#define RULE_CUMULATIVE 2u // all samples since it was first seen have the same weight
+#define RULE_ADAPTIVE 3u // the same where nothing changes, more for new ones where something does
+#define HISTORY_THERE 1u // there is a frame before
+#define HISTORY_STILL 2u // neither camera nor geometry has moved since
+#define HISTORY_SAME_VIEW 4u // the camera has not moved since
 #define BUCKET_SLOTS 64u // slots of a hash map that are probed for a key
 
 #define PATH_ORIGIN_X 0u // ray origin, world, m
@@ -217,6 +225,9 @@ typedef struct {
     uint filter_direct; // whether light that falls on it directly is shared too
     float screen_radius; // pixels; the screen filter's neighbours of a pixel's first sample
     uint screen_neighbours; // of a pixel, that the screen filter asks
+    uint temporal_rule; // RULE_OFF, RULE_EXPONENTIAL, RULE_CUMULATIVE or RULE_ADAPTIVE
+    float temporal_alpha; // weight of a frame, by the exponential rule
+    uint history_flags; // HISTORY_THERE, HISTORY_STILL, HISTORY_SAME_VIEW
     uint first_pass; // of this frame; passes are counted on from frame to frame
     float previous_origin[3]; // of the camera of the frame before; world, m
     float previous_right[3]; // unit, world
@@ -229,7 +240,7 @@ typedef struct {
     uint chain_numbers; // words from those of a chain to those of the next
     float large_steps; // chance of a path of new random numbers
     float splat_steps; // fixed-point steps of a splat as bright as the mean, a power of two
-    uint pad[2]; // fills the record
+    uint pad[3]; // fills the record
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.
@@ -264,7 +275,7 @@ typedef struct {
     float e2[3]; // third vertex minus first
     float offset; // m along ng that clears the rounding error of a point on it
     float ng[3]; // unit normal of the front side
-    float pad; // fills the record
+    uint shape; // number of its shape among those that are visible
 } Surface;
 
 /// A placing of a mesh that has a tree of its own; two cache lines.
@@ -427,32 +438,44 @@ typedef struct {
 /// The first surface that a sample sees.
 typedef struct {
     float p[3]; // world, m
-    uint there; // 0 if nothing is seen
+    uint shape; // 1 + its number, SHAPE_MOVES; 0 if nothing is seen
     float ns[3]; // unit, shading normal
-    float pad0; // fills the word
     float gate[3]; // throughput there, times the reflectance of the diffuse base
-    float pad1; // fills the word
     float share[3]; // part of what comes from beyond it that its diffuse base reflects
-    float pad2; // fills the record
+    float before[3]; // where it was in the frame before
 } Seen;
 
 /// The first surface that a pixel sees: means over its samples.
 typedef struct {
     float p[3]; // world, m
-    uint hits; // samples that see a surface; p and ns are theirs
+    uint hits; // samples that see a surface; p, ns and before are theirs
     float ns[3]; // of the shading normals
     uint count; // samples
     float gate[3]; // of all samples: 0 where one sees nothing
+    uint shape; // of the first sample
+    float before[3]; // where it was in the frame before
     float pad; // fills the record
 } SeenMean;
 
-/// Light of a pixel before the screen filter.
+/// Light of a pixel as the film and its history have it, before the screen filter.
 typedef struct {
     float rgb[3]; // radiance
-    float count; // samples that it is the mean of
+    float count; // samples that it is worth
     float base[3]; // of that, what the diffuse base of the first surface reflected
-    float pad; // fills the record
+    float alpha; // weight that this frame has in it
 } PixelLight;
+
+/// A pixel of the frame before: its light and what it sees.
+typedef struct {
+    float rgb[3]; // radiance
+    float count; // samples that it is worth; 0 if there is none
+    float base[3]; // of that, what the diffuse base of the first surface reflected
+    uint shape; // as SeenMean.shape
+    float p[3]; // world, m
+    float pad0; // fills the word
+    float ns[3]; // unit, shading normal
+    float pad1; // fills the record
+} History;
 
 /// The vertex of a sample behind which light is shared.
 typedef struct {

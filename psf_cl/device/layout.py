@@ -109,6 +109,9 @@ PARAMS = Record(
     uint filter_direct - whether light that falls on it directly is shared too
     float screen_radius - pixels; the screen filter's neighbours of a pixel's first sample
     uint screen_neighbours - of a pixel, that the screen filter asks
+    uint temporal_rule - RULE_OFF, RULE_EXPONENTIAL, RULE_CUMULATIVE or RULE_ADAPTIVE
+    float temporal_alpha - weight of a frame, by the exponential rule
+    uint history_flags - HISTORY_THERE, HISTORY_STILL, HISTORY_SAME_VIEW
     uint first_pass - of this frame; passes are counted on from frame to frame
     float previous_origin[3] - of the camera of the frame before; world, m
     float previous_right[3] - unit, world
@@ -167,7 +170,7 @@ SURFACE = Record(
     float e2[3] - third vertex minus first
     float offset - m along ng that clears the rounding error of a point on it
     float ng[3] - unit normal of the front side
-    float pad - fills the record
+    uint shape - number of its shape among those that are visible
     """),
 )
 
@@ -369,13 +372,11 @@ SEEN = Record(
     "The first surface that a sample sees.",
     _fields("""
     float p[3] - world, m
-    uint there - 0 if nothing is seen
+    uint shape - 1 + its number, SHAPE_MOVES; 0 if nothing is seen
     float ns[3] - unit, shading normal
-    float pad0 - fills the word
     float gate[3] - throughput there, times the reflectance of the diffuse base
-    float pad1 - fills the word
     float share[3] - part of what comes from beyond it that its diffuse base reflects
-    float pad2 - fills the record
+    float before[3] - where it was in the frame before
     """),
 )
 
@@ -384,22 +385,39 @@ SEEN_MEAN = Record(
     "The first surface that a pixel sees: means over its samples.",
     _fields("""
     float p[3] - world, m
-    uint hits - samples that see a surface; p and ns are theirs
+    uint hits - samples that see a surface; p, ns and before are theirs
     float ns[3] - of the shading normals
     uint count - samples
     float gate[3] - of all samples: 0 where one sees nothing
+    uint shape - of the first sample
+    float before[3] - where it was in the frame before
     float pad - fills the record
     """),
 )
 
 PIXEL_LIGHT = Record(
     "PixelLight",
-    "Light of a pixel before the screen filter.",
+    "Light of a pixel as the film and its history have it, before the screen filter.",
     _fields("""
     float rgb[3] - radiance
-    float count - samples that it is the mean of
+    float count - samples that it is worth
     float base[3] - of that, what the diffuse base of the first surface reflected
-    float pad - fills the record
+    float alpha - weight that this frame has in it
+    """),
+)
+
+HISTORY = Record(
+    "History",
+    "A pixel of the frame before: its light and what it sees.",
+    _fields("""
+    float rgb[3] - radiance
+    float count - samples that it is worth; 0 if there is none
+    float base[3] - of that, what the diffuse base of the first surface reflected
+    uint shape - as SeenMean.shape
+    float p[3] - world, m
+    float pad0 - fills the word
+    float ns[3] - unit, shading normal
+    float pad1 - fills the record
     """),
 )
 
@@ -465,6 +483,7 @@ RECORDS = (
     SEEN,
     SEEN_MEAN,
     PIXEL_LIGHT,
+    HISTORY,
     CELL_VERTEX,
     BEYOND,
     CELL,
@@ -659,6 +678,14 @@ CONSTANTS = (
     ("CELL_JITTER", 1, "points are moved before they are told apart by cells"),
     ("CELL_NEAR", 4, "samples of light from near have cells of their own"),
     ("CELL_IDENTITY", 2, "every sample has a cell of its own: nothing is shared (tests)"),
+    ("SHAPE_MOVES", 0x80000000, "its triangles move between frames"),
+    ("RULE_OFF", 0, "frames know nothing of one another"),
+    ("RULE_EXPONENTIAL", 1, "a frame has a constant weight"),
+    ("RULE_CUMULATIVE", 2, "all samples since it was first seen have the same weight"),
+    ("RULE_ADAPTIVE", 3, "the same where nothing changes, more for new ones where something does"),
+    ("HISTORY_THERE", 1, "there is a frame before"),
+    ("HISTORY_STILL", 2, "neither camera nor geometry has moved since"),
+    ("HISTORY_SAME_VIEW", 4, "the camera has not moved since"),
     ("BUCKET_SLOTS", 64, "slots of a hash map that are probed for a key"),
 )
 

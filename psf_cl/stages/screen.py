@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from psf_cl.device import layout
 from psf_cl.settings import Settings
 from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
 
@@ -24,18 +23,16 @@ def plan(context: Context) -> StageSpec | None:
     """Return the stage, or None if the picture is not filtered."""
     if not context.on("BASE"):
         return None
-    pixels, light = context.pixel_count, layout.PIXEL_LIGHT.dtype
+    count = 4 * context.pixel_count
     return StageSpec(
         "screen",
         "the picture is filtered before it is handed out",
         "screen.cl",
+        flags=("LENS",),
         kernels=(
             KernelSpec("resolve_light", lanes=False),
             KernelSpec("filter_screen"),
         ),
-        buffers=(
-            BufferSpec("light", light, pixels, "light of the pixels before the filter", True),
-            BufferSpec("filtered", np.dtype(np.float32), 4 * pixels, "and after it", True),
-        ),
+        buffers=(BufferSpec("filtered", np.dtype(np.float32), count, "filtered picture", True),),
         per_pass=True,
     )

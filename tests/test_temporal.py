@@ -1,0 +1,204 @@
+"""Frames that share light: closed forms, images of as many samples, what must not be shared."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene_builder import build, camera, floor, glowing, lambertian, render, renderer
+
+from psf_cl.device.device import open_device
+from psf_cl.plan import make_plan
+from psf_cl.scene import primitives, transform
+from psf_cl.settings import Settings
+
+OUTPUTS = ("history", "alpha", "motion")
+SIZE = (40, 30)
+
+
+def room(size=SIZE, view=None):
+    """Return a lamp over a floor with a ball on it, under a sky."""
+    over = transform.translation((0.5, 2.0, 0)) @ transform.rotation_xyz_degrees((180, 0, 0))
+    ball = transform.translation((-0.3, 0.5, 0.5)) @ transform.scaling(0.5)
+    return build(
+        [
+            floor(3.0, lambertian((0.7, 0.5, 0.3))),
+            (primitives.sphere(8, 6), ball, lambertian((0.3, 0.6, 0.8))),
+            (primitives.quad(), over @ transform.scaling(0.3), glowing((8.0, 6.0, 4.0))),
+        ],
+        view or camera((0, 1.5, 3), (0, 0.5, 0), 45),
+        size,
+        environment=0.2,
+    )
+
+
+def sequence(device, scene, frames, spp=1, views=(), outputs=OUTPUTS, **settings):
+    """Return the images of so many frames; ``views`` are their cameras, if it moves."""
+    opened = renderer(device, scene, outputs, **settings)
+    images = []
+    for frame in range(frames):
+        if frame:
+            if views:
+                opened.scene = replace(opened.scene, cameras=(views[frame],))
+            opened.set_frame(frame / 24)
+        opened.render(spp=spp)
+        images.append(opened.image())
+    opened.close()
+    return images
+
+
+def test_frames_that_share_nothing_leave_nothing_behind():
+    plan = make_plan(room(), Settings())
+    assert plan.features["TEMPORAL"].value == plan.features["SEEN"].value == 0
+    assert not {"seen", "temporal"} & {stage.name for stage in plan.stages}
+    assert dict(plan.left_out)["temporal"] == "temporal is off"
+    on = make_plan(room(), Settings(temporal="adaptive"))
+    assert {"seen", "temporal"} <= {stage.name for stage in on.stages}
+    assert on.features["BASE"].value == 0
+
+
+def test_frames_of_a_still_scene_become_the_image_of_all_their_samples(device):
+    """Passes go on from frame to frame, so that 16 frames have the samples of 16 passes."""
+    images = sequence(device, room(), 16, temporal="cumulative")
+    np.testing.assert_allclose(images[-1].rgb, render(device, room(), 16).rgb, atol=1e-5)
+    for number, image in enumerate(images, start=1):
+        # Nothing is rejected, at no edge either.
+        np.testing.assert_array_equal(image.aovs["history"], number)
+        np.testing.assert_allclose(image.aovs["alpha"], 1 / number, rtol=1e-6)
+        np.testing.assert_array_equal(image.aovs["motion"], 0.0)
+
+
+def test_a_frame_of_more_samples_weighs_more(device):
+    opened = renderer(device, room(), OUTPUTS, temporal="cumulative")
+    opened.render(spp=1)
+    opened.set_frame(0.1)
+    opened.render(spp=3)
+    image = opened.image()
+    opened.close()
+    np.testing.assert_array_equal(image.aovs["alpha"], 0.75)
+    np.testing.assert_allclose(image.rgb, render(device, room(), 4).rgb, atol=1e-5)
+
+
+def test_adaptive_has_the_bits_of_cumulative_while_nothing_changes(device):
+    truth = sequence(device, room(), 6, temporal="cumulative")
+    images = sequence(device, room(), 6, temporal="adaptive")
+    for image, expected in zip(images, truth, strict=True):
+        assert image.rgb.tobytes() == expected.rgb.tobytes()
+
+
+def test_exponential_follows_its_recurrence_and_reaches_its_variance(device):
+    """Independent samples of variance v: (1 - a) and a of it leave a / (2 - a) v in the end."""
+    alpha, frames = 0.25, 24
+    settings = {"sampler": "random", "seed": 5}
+    alone = sequence(device, room(), frames, **settings)
+    images = sequence(
+        device, room(), frames, temporal="exponential", temporal_alpha=alpha, **settings
+    )
+    expected = alone[0].rgb.astype(np.float64)
+    for image, own in zip(images[1:], alone[1:], strict=True):
+        expected = (1 - alpha) * expected + alpha * own.rgb
+        np.testing.assert_allclose(image.rgb, expected, rtol=1e-4, atol=1e-6)
+    truth = render(device, room(), 256, sampler="random", seed=9).rgb
+    single = np.mean([(image.rgb - truth) ** 2 for image in alone])
+    left = np.mean([(image.rgb - truth) ** 2 for image in images[12:]])
+    assert left / single == pytest.approx(alpha / (2 - alpha), rel=0.2)
+
+
+def test_a_camera_that_moves_by_pixels_takes_its_history_along(device):
+    """A wall across the view: history moves with it, whole pixels, and is new where it comes in."""
+    wall = transform.rotation_xyz_degrees((90, 0, 0))
+    size, distance = (32, 24), 2.0
+    footprint = distance * 2 * np.tan(np.radians(20)) / size[1]
+    views = [
+        camera((step * footprint, 0, distance), (step * footprint, 0, 0), 40) for step in (0, 3, 6)
+    ]
+    parts = [(primitives.quad(), wall @ transform.scaling(50.0), lambertian(0.5))]
+    scene = build(parts, views[0], size, environment=1.0)
+    images = sequence(device, scene, 3, views=views, temporal="cumulative")
+    np.testing.assert_allclose(images[1].aovs["motion"][..., 0], -3.0, atol=1e-3)
+    np.testing.assert_allclose(images[1].aovs["motion"][..., 1], 0.0, atol=1e-3)
+    history = np.broadcast_to(np.minimum((31 - np.arange(32)) // 3 + 1, 3), (24, 32))
+    np.testing.assert_allclose(images[2].aovs["history"][..., 0], history, atol=1e-3)
+    # What was seen before is the mean of what the frames saw there.
+    alone = sequence(device, scene, 3, views=views)
+    mean = (alone[0].rgb[:, 6:] + alone[1].rgb[:, 3:-3] + alone[2].rgb[:, :-6]) / 3
+    np.testing.assert_allclose(images[2].rgb[:, :-6], mean, atol=2e-3)
+
+
+def test_what_a_moving_camera_newly_sees_has_no_history(device):
+    views = [camera((0.1 * k, 1.5, 3), (0.1 * k, 0.5, 0), 45) for k in range(4)]
+    images = sequence(device, room(), 4, views=views, temporal="cumulative")
+    alone = sequence(device, room(), 4, views=views)
+    fresh = images[-1].aovs["alpha"][..., 0] == 1.0
+    # Behind the ball, at the border, at edges; most of the picture is known.
+    assert 0.02 < fresh.mean() < 0.4
+    np.testing.assert_array_equal(images[-1].rgb[fresh], alone[-1].rgb[fresh])
+    truth = render(device, replace(room(), cameras=(views[-1],)), 256).rgb
+    error = [np.mean((s[-1].rgb - truth) ** 2 / (truth**2 + 0.01)) for s in (images, alone)]
+    assert error[0] < 0.5 * error[1]
+
+
+def test_a_cut_to_another_camera_starts_anew(device):
+    views = [camera((0, 1.5, 3), (0, 0.5, 0), 45), camera((3, 1.0, 0), (0, 0.5, 0), 30)]
+    images = sequence(device, room(), 2, views=views, temporal="cumulative")
+    alone = sequence(device, room(), 2, views=views)
+    fresh = images[1].aovs["alpha"][..., 0] == 1.0
+    np.testing.assert_array_equal(images[1].rgb[fresh], alone[1].rgb[fresh])
+    # The floor may show the same place to both: what is kept is right, not only plausible.
+    truth = render(device, replace(room(), cameras=(views[1],)), 256).rgb
+    error = [np.mean((s[1].rgb - truth) ** 2) for s in (images, alone)]
+    assert fresh.mean() > 0.5 and error[0] < 1.2 * error[1]
+
+
+def test_sequences_have_the_same_bits_for_any_pool_and_any_number_of_looks(device):
+    views = [camera((0.05 * k, 1.5, 3), (0, 0.5, 0), 45) for k in range(4)]
+    settings = {"temporal": "adaptive", "screen_filter": "path_space"}
+    truth = sequence(device, room(), 4, spp=2, views=views, **settings)
+    small = open_device(traits=replace(device.traits, slots=128))
+    opened = renderer(small, room(), **settings)
+    for view, image in zip(views, truth, strict=True):
+        if view is not views[0]:
+            opened.scene = replace(opened.scene, cameras=(view,))
+            opened.set_frame(0.0)
+        for _ in range(2):
+            opened.step()
+            opened.snapshot()
+        np.testing.assert_array_equal(opened.snapshot().rgb, image.rgb)
+    opened.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lanes", [1, 8])
+def test_lane_widths_agree_on_sequences(device, lanes):
+    views = [camera((0.05 * k, 1.5, 3), (0, 0.5, 0), 45) for k in range(4)]
+    traits = replace(device.traits, lanes=lanes, block=max(lanes, 8), slots=512)
+    image = sequence(open_device(traits=traits), room(), 4, views=views, temporal="adaptive")[-1]
+    truth = sequence(device, room(), 4, views=views, temporal="adaptive")[-1]
+    close = np.isclose(image.rgb, truth.rgb, rtol=1e-3, atol=1e-4).all(axis=-1)
+    assert close.mean() > 0.97
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rule", ["cumulative", "adaptive"])
+def test_64_frames_have_the_error_of_64_samples(device, rule):
+    truth = render(device, room(), 2048, seed=3).rgb
+    image = sequence(device, room(), 64, temporal=rule)[-1]
+
+    def error(rgb):
+        return np.mean((rgb - truth) ** 2 / (truth**2 + 0.01))
+
+    assert error(image.rgb) == pytest.approx(error(render(device, room(), 64).rgb), rel=0.1)
+
+
+@pytest.mark.slow
+def test_100_frames_take_no_more_memory_than_two_and_repeat_their_bits(device):
+    views = [camera((0.02 * k, 1.5, 3), (0, 0.5, 0), 45) for k in range(100)]
+    bits, peaks = [], []
+    for frames in (2, 100, 100):
+        fresh = open_device()
+        image = sequence(fresh, room(), frames, views=views, temporal="adaptive")[-1]
+        bits.append(image.rgb.tobytes())
+        peaks.append(image.stats["peak_device_bytes"])
+    assert bits[1] == bits[2]
+    assert peaks[0] == peaks[1] == peaks[2]
