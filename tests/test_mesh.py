@@ -234,6 +234,24 @@ def test_a_binary_ply_comes_through_in_both_byte_orders(tmp_path, form, order):
     assert corners(ply(tmp_path, data).shapes[0].mesh) == [[[0, 0, 0], [2, 0, 0], [0, 3, 0]]]
 
 
+@pytest.mark.parametrize(("form", "order"), [("little", "<"), ("big", ">")])
+def test_a_binary_ply_may_mix_polygons(tmp_path, form, order):
+    more = "property float s\nproperty float t\nproperty uchar red\nproperty uchar green\n"
+    head = ply_header(f"binary_{form}_endian", 5, 3, more + "property uchar blue\n")
+    points = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (2, 2, 0)]
+    body = b"".join(struct.pack(order + "5f3B", *p, p[0], p[1], 255, 0, 0) for p in points)
+    for face in ((0, 1, 2, 3), (2, 4, 3), (0, 1, 2, 4, 3)):
+        body += struct.pack(f"{order}B{len(face)}i", len(face), *face)
+    mesh = ply(tmp_path, head.encode() + body).shapes[0].mesh
+    fans = [[0, 1, 2], [0, 2, 3], [2, 4, 3], [0, 1, 2], [0, 2, 4], [0, 4, 3]]
+    assert mesh.triangles.tolist() == fans
+    np.testing.assert_allclose(mesh.positions, points)
+    np.testing.assert_allclose(mesh.uvs, [(x, 1 - y) for x, y, _ in points])
+    np.testing.assert_allclose(mesh.colors, [(1, 0, 0, 1)] * 5)
+    with pytest.raises(InputError, match="not a sound PLY"):
+        ply(tmp_path, head.encode() + body[:-1])
+
+
 def test_ply_normals_and_uvs_are_kept_with_v_turned_over(tmp_path):
     more = "".join(f"property float {name}\n" for name in ("nx", "ny", "nz", "u", "v"))
     text = ply_header("ascii", 3, 1, more)

@@ -315,12 +315,14 @@ end_header
 """
 
 
-def binary_ply() -> bytes:
-    """Return a binary file of a quad."""
+def binary_ply(mixed: bool) -> bytes:
+    """Return a binary file of a quad, and of a triangle if it is ``mixed``."""
     head = RICH_PLY.split(b"property float nx")[0].replace(b"ascii", b"binary_little_endian")
     head += b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
     corners = b"".join(struct.pack("<fdf", x, y, 0) for x, y in ((0, 0), (1, 0), (0, 1), (1, 1)))
-    return head + corners + struct.pack("<B4i", 4, 0, 1, 3, 2)
+    more = struct.pack("<B3i", 3, 0, 1, 2) if mixed else b""
+    head = head.replace(b"face 1", b"face 2") if mixed else head
+    return head + corners + struct.pack("<B4i", 4, 0, 1, 3, 2) + more
 
 
 def corpus(kind: str, folders: list[Path]) -> list[bytes]:
@@ -328,7 +330,7 @@ def corpus(kind: str, folders: list[Path]) -> list[bytes]:
     own = {
         "gltf": lambda: [rich_gltf()],
         "obj": lambda: [RICH_OBJ + b"\0" + RICH_MTL],
-        "ply": lambda: [RICH_PLY, binary_ply()],
+        "ply": lambda: [RICH_PLY, binary_ply(False), binary_ply(True)],
         "toml": lambda: [path.read_bytes() for path in sorted((ROOT / "scenes").glob("*.toml"))],
     }[kind]()
     suffixes = {"gltf": (".gltf", ".glb")}.get(kind, (f".{kind}",))

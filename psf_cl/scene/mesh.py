@@ -22,6 +22,7 @@ from psf_cl.errors import InputError
 from psf_cl.files import read_file
 from psf_cl.scene.model import Material, Mesh, Scene, Shape
 from psf_cl.scene.mtl import MaterialLibrary, Picture
+from psf_cl.scene.polygons_ply import load_polygons
 from psf_cl.scene.texture import decoded_srgb
 
 SUFFIXES = (".obj", ".ply", ".stl")
@@ -69,7 +70,16 @@ def load_mesh_scene(path: Path) -> Scene:
 def _load_ply(path: Path, data: bytes) -> Scene:
     from trimesh.exchange.ply import load_ply
 
-    read = _guarded(path, "PLY", lambda: load_ply(io.BytesIO(data), skip_materials=True))
+    def read_ply() -> dict[str, Any]:
+        try:
+            return load_ply(io.BytesIO(data), skip_materials=True)
+        except _READER_ERRORS:
+            polygons = load_polygons(data)
+            if polygons is None:
+                raise
+            return polygons
+
+    read = _guarded(path, "PLY", read_ply)
     library = MaterialLibrary(path)
     material = Material()
     # MeshLab's way to name a texture.
@@ -148,7 +158,7 @@ def _mesh_of(path: Path, name: str, part: dict[str, Any]) -> Mesh | None:
         raise InputError(f"{path}: vertex index {bad} is out of range; there are {len(positions)}")
     fan = [faces[:, [0, corner, corner + 1]] for corner in range(1, faces.shape[1] - 1)]
     visual = part.get("visual")
-    uvs = getattr(visual, "uv", None)
+    uvs = getattr(visual, "uv", part.get("uvs"))
     uvs = None if uvs is None or np.shape(uvs) != (len(positions), 2) else _float32(uvs)
     if uvs is not None:
         # v grows upwards in these formats.
