@@ -323,10 +323,9 @@ def test_number_of_threads_does_not_show(device):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["cornell_box", "glossy"])
-def test_mean_over_seeds_is_that_of_path_tracing(device, name):
+def test_mean_over_seeds_is_that_of_path_tracing(device):
     """Within 1 % over 8 seeds, and each block within five standard errors."""
-    scene = load_scene(ROOT / f"scenes/{name}.toml", size=(64, 64))
+    scene = load_scene(ROOT / "scenes/cornell_box.toml", size=(64, 64))
     truth = render_path(device, scene, 2048).rgb
     images = [
         render(device, scene, 128, chains=1024, seed=seed).rgb.astype(np.float64)
