@@ -8,6 +8,7 @@
 #include "common/pixels.h"
 #include "common/pool.h"
 #include "common/rng.h"
+#include "common/hash_map.h"
 
 /// Slots that have nothing to do but take the next sample.
 static inline Mask is_free(UInt status)
@@ -62,6 +63,9 @@ static inline uint regenerate(
         radiance = pick_v(bad, black, radiance);
         if (any_lane(bad))
             atomic_add(&counters[COUNTER_REJECTED_SAMPLES], count_lanes(bad));
+
+        const Mask dark = done & (exponent == 0u);
+        tally->dark += count_lanes(dark);
 
         const UInt pass = sample & ring_mask;
         uint lane_pass[W];
@@ -209,6 +213,7 @@ kernel void regenerate_paths(
     tally.pass = 0;
     tally.finished = 0;
     tally.started = 0;
+    tally.dark = 0;
     for (uint item = first; item < end; ++item)
         claimed = regenerate(params, pool_at(pool, item), claimed, &tally, counters,
 #if AOV_DIRECT
@@ -222,6 +227,8 @@ kernel void regenerate_paths(
 #endif
                              samples);
     hand_in(&tally, counters);
+    if (tally.dark > 0)
+        add_fixed(&counters[COUNTER_DARK_SAMPLES], &counters[COUNTER_DARK_SAMPLES_HIGH], tally.dark, 0u);
     if (tally.started > 0)
         atomic_add(&counters[COUNTER_PENDING_CAMERA], tally.started);
 }

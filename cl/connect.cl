@@ -6,9 +6,17 @@
 #include "common/pool.h"
 #include "common/trace.h"
 #include "common/sharing.h"
+#include "common/guide.h"
 
 /// Trace the shadow rays of the W paths of a work item; returns how many there were.
-static inline uint connect_paths(__global const Params *params, __global Float *path, GEOMETRY_BUFFERS)
+static inline uint connect_paths(
+    __global const Params *params,
+    __global Float *path,
+#if GUIDE
+    volatile __global uint *counters,
+    __global GuideSum *guide_sums,
+#endif
+    GEOMETRY_BUFFERS)
 {
     const Vec3 light = get_v(path, PATH_LIGHT_R);
     // Not a number must not vanish here: it goes on into the sample, which is rejected and counted.
@@ -49,6 +57,13 @@ static inline uint connect_paths(__global const Params *params, __global Float *
 #if AOV_DIRECT
     put_v(path, PATH_DIRECT_R, add(get_v(path, PATH_DIRECT_R), pick_v(depth == 0u, arrives, zero)));
 #endif
+#if GUIDE
+    // What the ray before met reflects this light along it.
+    const UInt noise = mix_bits(get_u(path, PATH_SEED) + get_u(path, PATH_SAMPLE) * 0x9e3779b9u
+                                + get_u(path, PATH_STATUS) * 0x85ebca6bu);
+    learn(params, guide_sums, counters, wanted & !blocked, get_u(path, PATH_GUIDE_FROM),
+          FIELD(path, PATH_GUIDE_LIGHT), 0, noise);
+#endif
     put_v(path, PATH_LIGHT_R, zero);
     return count_lanes(wanted);
 }
@@ -57,19 +72,27 @@ static inline uint connect_paths(__global const Params *params, __global Float *
 ///
 /// Also paths that have ended may have a last one.
 ///
-/// reads   pool.{shadow, toward, light, status, vertex, base_light}; geometry
-/// writes  pool.radiance (direct, base, beyond), pool.light (cleared); counters.pending_shadow
+/// reads   pool.{shadow, toward, light, status, vertex}; with GUIDE pool.{guide_from, guide_light, sample, seed};
+///         geometry
+/// writes  pool.radiance (direct, beyond), pool.light (cleared); counters.pending_shadow; with GUIDE guide_sums
 kernel void connect_lights(
     __global const Params *params,
     __global float *pool,
     volatile __global uint *counters,
+#if GUIDE
+    __global GuideSum *guide_sums,
+#endif
     GEOMETRY_BUFFERS)
 {
     const uint first = get_global_id(0) * RUN;
     const uint end = min(first + RUN, params->slots / W);
     uint wanted = 0;
     for (uint item = first; item < end; ++item)
-        wanted += connect_paths(params, pool_at(pool, item), GEOMETRY_BUFFER_ARGUMENTS);
+        wanted += connect_paths(params, pool_at(pool, item),
+#if GUIDE
+                                counters, guide_sums,
+#endif
+                                GEOMETRY_BUFFER_ARGUMENTS);
     if (wanted > 0)
         atomic_add(&counters[COUNTER_PENDING_SHADOW], wanted);
 }

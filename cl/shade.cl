@@ -12,6 +12,8 @@
 #include "common/light.h"
 #include "common/sharing.h"
 #include "common/chain.h"
+#include "common/guide.h"
+#include "common/guided.h"
 
 #define MAX_SURVIVAL 0.999f
 
@@ -136,9 +138,10 @@ static inline void store_features(
 /// Shade what the rays hit, prepare a shadow ray, and send the paths on or end them.
 ///
 /// reads   pool, scene tables
-/// writes  pool.{status, origin, direction, beta, radiance, direct, base, base_share, base_light, pdf, shadow,
-///         toward, light}; features; seen; with LIGHT_SAMPLING pool.light_normal;
-///         with CELLS pool.{vertex, length, beyond, share, light_share}, vertices
+/// writes  pool.{status, origin, direction, beta, radiance, direct, pdf, shadow, toward, light}; features;
+///         with CELLS pool.{vertex, length, beyond, share, light_share}, vertices; with GUIDE
+///         pool.{guide, guide_from, guide_light, expected}, guide_keys, guide_full, guide_sums,
+///         counters.{guide_failed, guide_rejected} (atomic)
 kernel void shade_paths(
     __global const Params *params,
     __global const Surface *surfaces,
@@ -167,6 +170,13 @@ kernel void shade_paths(
 #if METROPOLIS
     __global float *chains,
     __global uint *chain_numbers,
+#endif
+#if GUIDE
+    volatile __global uint *counters,
+    volatile __global uint *guide_keys,
+    __global uint *guide_full,
+    __global GuideSum *guide_sums,
+    __global const GuideCell *guide_cells,
 #endif
     __global float *pool)
 {
@@ -319,6 +329,17 @@ kernel void shade_paths(
     if (any_lane(sees))
         store_seen(params, seen, sees, hit, sample, pixel, shape, s.p, before, s.ns, zero);
 #endif
+#if GUIDE
+    const UInt noise = mix_bits(mix_bits(get_u(path, PATH_SEED) + depth * 0x9e3779b9u) + sample);
+    const Mask learning = alive & (sample < counters[COUNTER_LEARN_LIMIT]);
+    const Guide guide = find_guide(params, guide_keys, guide_cells, guide_full, counters, goes_on, any_lane(learning),
+                                   guide_cell_of(params, s.p, s.ns, noise));
+    // What the last ray brought: what this surface emits, and reflects of what its own cell knows of.  What
+    // it reflects of a light that a shadow ray finds is added when that is known.
+    const UInt guide_from = pick_u(learning & !camera_ray, get_u(path, PATH_GUIDE), (UInt)(NO_PART));
+    learn(params, guide_sums, counters, learning, guide_from,
+          luminance(emitted) + luminance(b.base_color) * guide.mean, 1, mix_bits(noise));
+#endif
     if (!any_lane(goes_on)) {
         put_u(path, PATH_STATUS, pick_u(alive, STATUS_DONE | depth, status));
         return;
@@ -327,7 +348,20 @@ kernel void shade_paths(
 #if !TANGENTS
     Vec3 tangent;
     Vec3 bitangent;
+#if GUIDE
+    guide_frame(s.ns, &tangent, &bitangent);
+#else
     make_frame(s.ns, &tangent, &bitangent);
+#endif
+#elif GUIDE
+    Vec3 guide_s;
+    Vec3 guide_t;
+    guide_frame(s.ns, &guide_s, &guide_t);
+    GuideTurn turn;
+    turn.xs = dot3(tangent, guide_s);
+    turn.xt = dot3(tangent, guide_t);
+    turn.ys = dot3(bitangent, guide_s);
+    turn.yt = dot3(bitangent, guide_t);
 #endif
     const Vec3 wo_local = vec3(dot3(tangent, wo), dot3(bitangent, wo), max(dot3(s.ns, wo), (Float)(1e-6f)));
     const LobeChances chances = lobe_chances(b, wo_local.z);
@@ -391,6 +425,9 @@ kernel void shade_paths(
         const Vec3 wi_local = vec3(dot3(tangent, light.wi), dot3(bitangent, light.wi), dot3(s.ns, light.wi));
         Float pdf;
         const Vec3 f = eval_bsdf(b, chances, wo_local, wi_local, dot3(s.ng, light.wi), &pdf);
+#if GUIDE
+        guide_pdf(guide_cells, guide.known, chances, wi_local GUIDE_TURN, &pdf);
+#endif
         Float weight = (Float)(1.0f);
         if (params->direct_sampling == DIRECT_MIS)
             weight = pick(light.extended, power_heuristic(light.pdf, pdf), weight);
@@ -400,6 +437,11 @@ kernel void shade_paths(
         const Vec3 arrives =
             mul(mul(beta, f), scale(light.radiance, weight / pick(lit, light.pdf, (Float)(1.0f))));
         put_v(path, PATH_LIGHT_R, pick_v(lit, arrives, zero));
+#if GUIDE
+        put_u(path, PATH_GUIDE_FROM, guide_from);
+        FIELD(path, PATH_GUIDE_LIGHT) = luminance(
+            mul(f, scale(light.radiance, weight / pick(lit, light.pdf, (Float)(1.0f)))));
+#endif
 #if CELLS == 2
         put_v(path, PATH_LIGHT_SHARE_R, pick_v(chosen, base_share(b, chances, base, wi_local, f), share));
 #endif
@@ -416,11 +458,19 @@ kernel void shade_paths(
     Float u1;
     Float u2;
     sample_pair(seed, index, pair + PAIR_BSDF, params->sampler, &u1, &u2);
+#if GUIDE
+    const Vec3 drawn = sample_guided(guide_cells, guide.known, b, chances, wo_local GUIDE_TURN, u_lobe, u1, u2);
+#else
     const Vec3 drawn = sample_bsdf(b, chances, wo_local, u_lobe, u1, u2);
+#endif
     const Vec3 wi = renormalize3(
         add_scaled(add_scaled(scale(tangent, drawn.x), bitangent, drawn.y), s.ns, drawn.z));
     Float pdf;
     const Vec3 f = eval_bsdf(b, chances, wo_local, drawn, dot3(s.ng, wi), &pdf);
+#if GUIDE
+    const UInt part = guide_pdf(guide_cells, guide.known, chances, drawn GUIDE_TURN, &pdf);
+    put_u(path, PATH_GUIDE, guide_part(guide, part, u_lobe < chances.diffuse));
+#endif
 #if CELLS == 2
     share = pick_v(chosen, base_share(b, chances, base, drawn, f), share);
     put_v(path, PATH_SHARE_R, share);
@@ -432,6 +482,9 @@ kernel void shade_paths(
     if (any_lane(reflects))
         store_base_share(params, seen, reflects, sample, pixel, base_part);
 #endif
+#endif
+#if GUIDE
+    const Vec3 before = beta;
 #endif
     beta = mul(beta, scale(f, 1.0f / pick(pdf > 0.0f, pdf, (Float)(1.0f))));
     const Float carried = beta.x + beta.y + beta.z;
@@ -448,7 +501,13 @@ kernel void shade_paths(
                         & (((drawn.z < 0.0f) & (b.eta > 1.0f)) | ((drawn.z > 0.0f) & (b.eta < 1.0f)));
     worth *= pick(within, max(b.eta * b.eta, 1.0f / (b.eta * b.eta)), (Float)(1.0f));
 #endif
-    const Float chance = pick(roulette, min(worth, (Float)(MAX_SURVIVAL)), (Float)(1.0f));
+    Float chance = pick(roulette, min(worth, (Float)(MAX_SURVIVAL)), (Float)(1.0f));
+#if GUIDE
+    const Float to_come = luminance(mul(before, b.base_color)) * guide.mean;
+    const Float expected = pick(camera_ray, to_come, FIELD(path, PATH_EXPECTED));
+    FIELD(path, PATH_EXPECTED) = expected;
+    chance = pick(roulette, informed_chance(to_come, expected, chance), chance);
+#endif
     survives &= left_of_choice(chances, u_lobe) < chance;
     beta = scale(beta, 1.0f / pick(survives, chance, (Float)(1.0f)));
 

@@ -31,6 +31,7 @@ from psf_cl.stages import (
     cells,
     connect,
     film,
+    guide,
     intersect,
     metropolis,
     screen,
@@ -288,6 +289,7 @@ def make_plan(
         film,
         temporal,
         screen,
+        guide,
     ):
         stage = module.plan(context)
         if stage is not None:
@@ -501,6 +503,11 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             f"{', '.join(sorted(feature_aovs))} asked for",
             "no albedo, normal or depth was asked for",
         ),
+        "GUIDE": switch(
+            settings.guiding == "learned",
+            "guiding is learned",
+            "guiding is off",
+        ),
         "CELLS": _cells(settings, glossy),
         "SEEN": _seen(settings, outputs),
         "BASE": _base(settings, glossy),
@@ -574,6 +581,8 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     full["LIGHT_SAMPLING"] = features["LIGHT_SAMPLING"]
     # Chains are another integrator, which has no images beside the one.
     full["METROPOLIS"] = features["METROPOLIS"]
+    # Directions would be drawn otherwise: the image would have other noise.
+    full["GUIDE"] = features["GUIDE"]
     if features["METROPOLIS"].value:
         names = ("AOV_DIRECT", "AOV_FEATURES", "BASE", "CELLS", "SEEN")
         full |= {name: features[name] for name in names}

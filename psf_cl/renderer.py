@@ -37,7 +37,7 @@ from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Scene
 from psf_cl.scheduler import Hooks, Progress, Scheduler, doubling_epoch
 from psf_cl.settings import Settings, resolve
-from psf_cl.stages import cells, film, metropolis, screen, temporal
+from psf_cl.stages import cells, film, guide, metropolis, screen, temporal
 
 #: Looks of the host at the counters for each count of the paths by depth, which takes 0.4 ms on two
 #: CPU cores; the first look, which is left out, is at a pool that is still empty.
@@ -203,6 +203,12 @@ class Renderer:
 
     def _between(self, start: int) -> None:
         """Do what the paths of an epoch need that begins with pass ``start``."""
+        if self.freeze_guide is not None:
+            epoch = range(start, doubling_epoch(start, self.plan.shortest_epoch))
+            self.freeze_guide.set(fades=int(0 < start <= guide.FADING_PASSES))
+            self.freeze_guide(guide.slots_of(self.plan.pixel_count), film.GROUP)
+            value = np.array([guide.learn_limit(epoch)], np.uint32)
+            self.device.write(self.buffers["counters"], value, layout.COUNTER_INDEX["learn_limit"])
         if self.chains is not None:
             self.chains.measure() if start else self.chains.start()
 
@@ -561,6 +567,8 @@ class Renderer:
                 "rejected_samples": int(counters[layout.COUNTER_INDEX["rejected_samples"]]),
                 "dropped_triangles": self.dropped_triangles,
             },
+            "paths": self._path_statistics(counters, rays),
+            "guide": self._guide_statistics(counters),
             "cells": self._cell_statistics(counters),
             "metropolis": self.chains.statistics() if self.chains else None,
             "bvh": None
@@ -576,21 +584,42 @@ class Renderer:
             "seed": self.settings.seed,
         }
 
+    def _guide_statistics(self, counters: np.ndarray) -> dict[str, int | float] | None:
+        if self.freeze_guide is None:
+            return None
+        keys = self.device.read(self.buffers["guide_keys"])
+        visits = self.device.read(self.buffers["guide_cells"])["visits"]
+        return {
+            "cells": int(np.count_nonzero(keys)),
+            "load": float(np.count_nonzero(keys)) / len(keys),
+            "taught_cells": int(np.count_nonzero(visits >= layout.CONSTANT["GUIDE_BINS"])),
+            "failed_inserts": int(counters[layout.COUNTER_INDEX["guide_failed"]]),
+            "rejected": int(counters[layout.COUNTER_INDEX["guide_rejected"]]),
+        }
+
+    def _path_statistics(
+        self, counters: np.ndarray, rays: dict[str, int]
+    ) -> dict[str, float | None]:
+        """Return how long paths are, and which part of them brings no light at all."""
+        pending = int(counters[layout.COUNTER_INDEX["film_pass"]]) == 0
+        paths = max(rays["camera"], 1)
+        dark = layout.whole(counters, "dark_samples")
+        return {
+            "mean_rays": (rays["camera"] + rays["bounce"]) / paths,
+            "zero_contribution": None if pending else dark / paths,
+        }
+
     def _cell_statistics(self, counters: np.ndarray) -> dict[str, int | float] | None:
         if self.clear_cells is None:
             return None
 
-        def whole(name: str) -> int:
-            at = layout.COUNTER_INDEX[name]
-            return int(counters[at]) + (int(counters[at + 1]) << 32)
-
         names = ("failed_inserts", "rejected_cells", "unfiltered_samples")
-        used, passes = whole("cells_used"), max(self.scheduler.passes, 1)
+        used, passes = layout.whole(counters, "cells_used"), max(self.scheduler.passes, 1)
         slots = cells.slots_of(self.plan.pixel_count)
-        return {name: whole(name) for name in names} | {
+        return {name: layout.whole(counters, name) for name in names} | {
             "cells_per_pass": used / passes,
             "load": used / passes / slots,
-            "mean_probes": whole("cell_probes") / max(used, 1),
+            "mean_probes": layout.whole(counters, "cell_probes") / max(used, 1),
         }
 
     @property
@@ -723,6 +752,7 @@ class Renderer:
         values |= screen.parameters(settings)
         values |= metropolis.parameters(settings, self.plan.traits.slots, self.plan.pixel_count)
         values |= temporal.parameters(settings)
+        values |= guide.parameters(scene, settings, self.plan.pixel_count, values["scene_radius"])
         for name, value in values.items():
             params[0][name] = value
         return params
@@ -792,11 +822,24 @@ class Renderer:
                 -(-traits.slots // kernel.paths_per_item(traits)),
             )
             for stage in self.plan.stages
-            if not stage.per_pass
+            if not stage.per_pass and not stage.between_passes
             for kernel in stage.kernels
         ]
         self._bind_cells(programs.get("cells"))
         self._bind_chains(programs.get("splats"))
+        self.freeze_guide = (
+            programs["guide"].bind(
+                "freeze_guide",
+                params=self.buffers["params"],
+                guide_keys=self.buffers["guide_keys"],
+                guide_full=self.buffers["guide_full"],
+                guide_sums=self.buffers["guide_sums"],
+                guide_cells=self.buffers["guide_cells"],
+                fades=0,
+            )
+            if "guide" in programs
+            else None
+        )
         self.film_program = programs["film"]
         self.film_launches = [
             (self._add_launch(ring, name, planes, partial=False), planes)

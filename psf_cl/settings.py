@@ -77,6 +77,13 @@ class Settings:
     sampler: str = _choice(
         "sobol", "random", doc="Owen-scrambled Sobol' points, or independent numbers"
     )
+    guiding: str = _choice(
+        "off", "learned", doc="draw directions by what was learned of where light comes from"
+    )
+    guide_cell_size: float = _number(32.0, 1e-3, 1e6, doc="edge of a cell of the guide, pixels")
+    guide_share: float = _number(
+        0.75, 0.0, 0.99, doc="part of the directions of a diffuse lobe that the guide draws"
+    )
     path_filter: str = _choice(
         "off",
         "hash_grid",
@@ -182,13 +189,19 @@ def _checked(item: dataclasses.Field[Any], value: Any, prefix: str) -> Any:
 PRESETS: dict[str, dict[str, Any]] = {
     "pt": {},
     # Shadows of direct light are sharper than any cell; all other light is shared where it is seen.
+    "learned": {"guiding": "learned"},
     "psf": {"path_filter": "hash_grid", "filter_vertex": "1", "filter_direct": False},
     "mlt": {"integrator": "metropolis"},
 }
 
 
 #: What goes with ``integrator=metropolis``: it has no pixel's samples to share, guide or keep.
-METROPOLIS_NEEDS = {"path_filter": "off", "screen_filter": "off", "temporal": "off"}
+METROPOLIS_NEEDS = {
+    "guiding": "off",
+    "path_filter": "off",
+    "screen_filter": "off",
+    "temporal": "off",
+}
 
 
 def check_together(settings: Settings) -> None:

@@ -475,7 +475,16 @@ def test_plan_follows_the_options(all_features, capsys):
         return planned, {name for name, f in planned["features"].items() if not f["value"]}
 
     plan, off = features("")
-    unused = {"BASE", "CELLS", "FEW", "INSTANCES", "LAYERS", "LIGHT_SAMPLING", "METROPOLIS"}
+    unused = {
+        "BASE",
+        "CELLS",
+        "FEW",
+        "GUIDE",
+        "INSTANCES",
+        "LAYERS",
+        "LIGHT_SAMPLING",
+        "METROPOLIS",
+    }
     unused |= {"SEEN", "TANGENTS", "VERTEX_COLORS"}
     off_by_default = unused | {"AOV_DIRECT", "AOV_FEATURES"}
     assert off == off_by_default and plan["crop"] == [0, 0, 24, 16]

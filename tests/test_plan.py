@@ -254,6 +254,7 @@ def test_every_flag_at_once_renders(wants):
         screen_filter="path_space",
         temporal="adaptive",
         light_sampling="hierarchy",
+        guiding="learned",
     )
     # Chains of paths would leave out what samples of pixels are for, places the list of triangles.
     off = {name for name, feature in opened.plan.features.items() if not feature.value}

@@ -67,6 +67,9 @@
 #ifndef INSTANCES
 #error "INSTANCES must be 0, or the bits of a hit's index below the number of the instance"
 #endif
+#ifndef GUIDE
+#error "GUIDE must be 0 or 1"
+#endif
 #ifndef CELLS
 #error "CELLS must be 0, 1 (all of a vertex's light is shared) or 2 (that of its diffuse base)"
 #endif

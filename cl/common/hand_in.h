@@ -19,6 +19,7 @@ typedef struct {
     uint pass;     // of the ring
     uint finished; // samples of that pass
     uint started;  // paths
+    uint dark;     // samples that gathered nothing
 } Tally;
 
 static inline void hand_in(Tally *tally, volatile __global uint *counters)

@@ -213,6 +213,7 @@ static inline Vec3 pick_v(Mask mask, Vec3 then, Vec3 otherwise)
                 pick(mask, then.z, otherwise.z));
 }
 static inline Vec3 lerp3(Vec3 a, Vec3 b, Float t) { return add_scaled(a, sub(b, a), t); }
+static inline Float luminance(Vec3 rgb) { return 0.2126f * rgb.x + 0.7152f * rgb.y + 0.0722f * rgb.z; }
 static inline Float max3(Vec3 a) { return max(a.x, max(a.y, a.z)); }
 
 /// normalize3 where the square of the length leaves the range of float.

@@ -53,6 +53,8 @@
 #define HISTORY_THERE 1u // there is a frame before
 #define HISTORY_STILL 2u // neither camera nor geometry has moved since
 #define HISTORY_SAME_VIEW 4u // the camera has not moved since
+#define GUIDE_SIDE 8u // parts of the hemisphere a side of the square
+#define GUIDE_BINS 64u
 #define BUCKET_SLOTS 64u // slots of a hash map that are probed for a key
 
 #define PATH_ORIGIN_X 0u // ray origin, world, m
@@ -134,7 +136,16 @@
 #else
 #define PATH_END_5 PATH_END_4
 #endif
-#define PATH_FIELD_COUNT PATH_END_5
+#if GUIDE >= 1
+#define PATH_GUIDE (PATH_END_5 + 0u) // uint; part of the guide's cell that the ray left through; NO_PART: none
+#define PATH_GUIDE_FROM (PATH_END_5 + 1u) // uint; that of the ray before the shadow ray
+#define PATH_EXPECTED (PATH_END_5 + 2u) // luminance at the camera that the first vertex was expected to reflect
+#define PATH_GUIDE_LIGHT (PATH_END_5 + 3u) // luminance that arrives through the shadow ray, reflected along that
+#define PATH_END_6 (PATH_END_5 + 4u)
+#else
+#define PATH_END_6 PATH_END_5
+#endif
+#define PATH_FIELD_COUNT PATH_END_6
 
 #define CHAIN_KNOWN 0u // uint; pairs of numbers of the state from which the path starts; 0: a large step
 #define CHAIN_PAIRS 1u // uint; pairs of numbers that the state has
@@ -176,10 +187,15 @@
 #define COUNTER_CELL_PROBES_HIGH 20u // high word
 #define COUNTER_CHAIN_LIMIT 21u // first path of a chain that must not be started; set by the host
 #define COUNTER_CHAIN_STARTS 22u // paths of chains that ended before the first pass
-#define COUNTER_PENDING_CAMERA 23u // rays since the last film launch
-#define COUNTER_PENDING_BOUNCE 24u
-#define COUNTER_PENDING_SHADOW 25u
-#define COUNTER_FINISHED 26u // first of the ring: samples done of each pass in flight
+#define COUNTER_DARK_SAMPLES 23u // low word; samples that gathered no light
+#define COUNTER_DARK_SAMPLES_HIGH 24u // high word
+#define COUNTER_GUIDE_FAILED 25u // vertices that found their part of the table of the guide full
+#define COUNTER_GUIDE_REJECTED 26u // what is not finite, or too large for the sums of the guide
+#define COUNTER_LEARN_LIMIT 27u // first pass that the guide learns nothing from; set by the host
+#define COUNTER_PENDING_CAMERA 28u // rays since the last film launch
+#define COUNTER_PENDING_BOUNCE 29u
+#define COUNTER_PENDING_SHADOW 30u
+#define COUNTER_FINISHED 31u // first of the ring: samples done of each pass in flight
 
 /// Everything that is the same for all paths of a render.
 typedef struct {
@@ -240,7 +256,13 @@ typedef struct {
     uint chain_numbers; // words from those of a chain to those of the next
     float large_steps; // chance of a path of new random numbers
     float splat_steps; // fixed-point steps of a splat as bright as the mean, a power of two
-    uint pad[3]; // fills the record
+    uint guide_slots; // of the table of the guide, a power of two
+    float guide_width; // edge of its cells, m per m from the camera
+    float guide_least; // edge of the smallest of them, m
+    float guide_most; // edge of the largest, m
+    float guide_share; // of the directions of a diffuse lobe that the guide draws
+    float guide_steps; // fixed-point steps of a sum of its radiance per unit, a power of two
+    float guide_limit; // radiance from which a sample is too large for these sums
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.
@@ -505,3 +527,19 @@ typedef struct {
     uint high[3]; // of radiance
     uint pad[2]; // fills the record
 } SplatSum;
+
+/// What a cell of the guide gathers: 64-bit fixed-point sums of each part of the hemisphere.
+typedef struct {
+    uint low[64]; // of radiance
+    uint high[64]; // of radiance
+    uint count[64]; // visits
+} GuideSum;
+
+/// What paths are drawn by at a cell of the guide, the same for a whole epoch.
+typedef struct {
+    float density[64]; // of each part, over that of the cosine, row by row
+    float rows[8]; // share of all rows up to this
+    float mean; // over the parts: what a white diffuse surface reflects of what no shadow ray finds
+    float visits; // that it is made from; 0: nothing is known
+    float pad[6]; // fills the record
+} GuideCell;

@@ -124,6 +124,13 @@ PARAMS = Record(
     uint chain_numbers - words from those of a chain to those of the next
     float large_steps - chance of a path of new random numbers
     float splat_steps - fixed-point steps of a splat as bright as the mean, a power of two
+    uint guide_slots - of the table of the guide, a power of two
+    float guide_width - edge of its cells, m per m from the camera
+    float guide_least - edge of the smallest of them, m
+    float guide_most - edge of the largest, m
+    float guide_share - of the directions of a diffuse lobe that the guide draws
+    float guide_steps - fixed-point steps of a sum of its radiance per unit, a power of two
+    float guide_limit - radiance from which a sample is too large for these sums
     """),
 )
 
@@ -462,6 +469,31 @@ SPLAT_SUM = Record(
     """),
 )
 
+#: Parts of the hemisphere that the guide tells apart, a side of the square.
+GUIDE_SIDE = 8
+
+GUIDE_SUM = Record(
+    "GuideSum",
+    "What a cell of the guide gathers: 64-bit fixed-point sums of each part of the hemisphere.",
+    _fields(f"""
+    uint low[{GUIDE_SIDE**2}] - of radiance
+    uint high[{GUIDE_SIDE**2}] - of radiance
+    uint count[{GUIDE_SIDE**2}] - visits
+    """),
+)
+
+GUIDE_CELL = Record(
+    "GuideCell",
+    "What paths are drawn by at a cell of the guide, the same for a whole epoch.",
+    _fields(f"""
+    float density[{GUIDE_SIDE**2}] - of each part, over that of the cosine, row by row
+    float rows[{GUIDE_SIDE}] - share of all rows up to this
+    float mean - over the parts: what a white diffuse surface reflects of what no shadow ray finds
+    float visits - that it is made from; 0: nothing is known
+    float pad[6] - fills the record
+    """),
+)
+
 RECORDS = (
     PARAMS,
     BVH_NODE,
@@ -488,6 +520,8 @@ RECORDS = (
     BEYOND,
     CELL,
     SPLAT_SUM,
+    GUIDE_SUM,
+    GUIDE_CELL,
 )
 
 #: Words of every path's state, in the order in which they lie in a block of the pool.
@@ -581,6 +615,16 @@ OPTIONAL_PATH_FIELDS = (
             ("light_share_b", ""),
         ),
     ),
+    (
+        "GUIDE",
+        1,
+        (
+            ("guide", "uint; part of the guide's cell that the ray left through; NO_PART: none"),
+            ("guide_from", "uint; that of the ray before the shadow ray"),
+            ("expected", "luminance at the camera that the first vertex was expected to reflect"),
+            ("guide_light", "luminance that arrives through the shadow ray, reflected along that"),
+        ),
+    ),
 )
 
 #: Words of every chain, in the order in which they lie in a block of chains.
@@ -627,6 +671,11 @@ COUNTERS = (
     ("cell_probes_high", "high word"),
     ("chain_limit", "first path of a chain that must not be started; set by the host"),
     ("chain_starts", "paths of chains that ended before the first pass"),
+    ("dark_samples", "low word; samples that gathered no light"),
+    ("dark_samples_high", "high word"),
+    ("guide_failed", "vertices that found their part of the table of the guide full"),
+    ("guide_rejected", "what is not finite, or too large for the sums of the guide"),
+    ("learn_limit", "first pass that the guide learns nothing from; set by the host"),
     ("pending_camera", "rays since the last film launch"),
     ("pending_bounce", ""),
     ("pending_shadow", ""),
@@ -686,6 +735,8 @@ CONSTANTS = (
     ("HISTORY_THERE", 1, "there is a frame before"),
     ("HISTORY_STILL", 2, "neither camera nor geometry has moved since"),
     ("HISTORY_SAME_VIEW", 4, "the camera has not moved since"),
+    ("GUIDE_SIDE", GUIDE_SIDE, "parts of the hemisphere a side of the square"),
+    ("GUIDE_BINS", GUIDE_SIDE**2, ""),
     ("BUCKET_SLOTS", 64, "slots of a hash map that are probed for a key"),
 )
 
@@ -797,9 +848,14 @@ def path_fields(*names: str) -> tuple[str, ...]:
     return tuple(found)
 
 
+def whole(counters: np.ndarray, name: str) -> int:
+    """Return a counter of two words."""
+    at = COUNTER_INDEX[name]
+    return int(counters[at]) + (int(counters[at + 1]) << 32)
+
+
 def rays_so_far(counters: np.ndarray, kind: str) -> int:
     """Return the rays of ``kind`` (one of ``RAY_KINDS``) that ``counters`` tell of."""
-    at = COUNTER_INDEX[f"{kind}_rays"]
     # Those since the last film launch have not been carried over into the two words yet.
     pending = int(counters[COUNTER_INDEX[f"pending_{kind}"]])
-    return int(counters[at]) + (int(counters[at + 1]) << 32) + pending
+    return whole(counters, f"{kind}_rays") + pending

@@ -20,7 +20,21 @@ def plan(context: Context) -> StageSpec | None:
         kept = (*kept, "base_light")
     # What blends by chance has random numbers of its path.
     numbers = ("seed", "sample", "status") if context.features["ALPHA"].value == 2 else ()
-    reads = ("light", "shadow", "toward", "radiance", *direct, *kept, *shared, *moved, *numbers)
+    learned = ("guide_from", "guide_light") if context.on("GUIDE") else ()
+    if learned:
+        numbers = ("seed", "sample", "status")
+    reads = (
+        "light",
+        "shadow",
+        "toward",
+        "radiance",
+        *direct,
+        *kept,
+        *shared,
+        *moved,
+        *learned,
+        *numbers,
+    )
     kernel = KernelSpec(
         "connect_lights",
         reads=tuple(dict.fromkeys(reads)),

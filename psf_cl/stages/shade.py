@@ -66,7 +66,11 @@ def _kernel(context: Context) -> KernelSpec:
     if context.features["BASE"].value == 2 and shadow:
         shadow += ("base_light",)
     chosen = ("light_normal",) if context.on("LIGHT_SAMPLING") else ()
-    walk = ("status", "direction", "beta", "radiance", "pdf", *direct, *base, *shared, *chosen)
+    guided = ("guide", "expected") if context.on("GUIDE") else ()
+    if guided and shadow:
+        shadow += ("guide_from", "guide_light")
+    walk = ("status", "direction", "beta", "radiance", "pdf")
+    walk += (*direct, *base, *shared, *chosen, *guided)
     records = [layout.SURFACE, layout.MATERIAL]
     if context.on("INSTANCES"):
         records.append(layout.INSTANCE)
@@ -88,10 +92,13 @@ def _kernel(context: Context) -> KernelSpec:
         records.append(layout.CELL_VERTEX)
     if context.on("SEEN"):
         records.append(layout.SEEN)
+    # Of the guide, its key, the words that a drawing looks at, and a sum and a count.
+    guide_bytes = 4 * (1 + 2 + 4 + 8 + 2 + 3) if context.on("GUIDE") else 0
     feature_bytes = 3 * 16 if context.on("AOV_FEATURES") else 0
     return KernelSpec(
         "shade_paths",
         reads=(*walk, "hit", "sample", "pixel", "seed"),
         writes=(*walk, "origin", *shadow),
-        record_bytes=sum(record.dtype.itemsize for record in records) + feature_bytes,
+        record_bytes=sum(record.dtype.itemsize for record in records) + feature_bytes + guide_bytes,
+        hash_accesses=int(context.on("GUIDE")),
     )

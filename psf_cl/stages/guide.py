@@ -1,0 +1,87 @@
+"""Guide: directions drawn by what was learned of where light comes from."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from psf_cl.device import layout
+from psf_cl.device.hash_map import SUM_BITS, buckets_of, fixed_point, slots_for
+from psf_cl.scene.model import Scene
+from psf_cl.settings import Settings
+from psf_cl.stages.cells import HEADROOM, brightest
+from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
+
+#: Slots of the table: a slot for so many pixels, within these bounds (a slot takes 1092 bytes).
+PIXELS_PER_SLOT = 16
+LEAST_SLOTS, MOST_SLOTS = 1 << 14, 1 << 16
+
+#: Visits that the sums of a part of a cell have room for.
+MOST_VISITS = 1 << 28
+
+#: Edges of cells, in radii of the scene.
+LEAST_EDGE, MOST_EDGE = 2.0**-10, 2.0**-3
+
+#: Passes of an epoch that are learned from, once epochs are longer.
+LEARNED_PASSES = 16
+
+
+#: First passes whose epochs count half after each: what was learned from little fades.
+FADING_PASSES = 32
+
+
+def slots_of(pixel_count: int) -> int:
+    """Return the slots of the table."""
+    return min(max(slots_for(pixel_count // PIXELS_PER_SLOT), LEAST_SLOTS), MOST_SLOTS)
+
+
+def parameters(
+    scene: Scene, settings: Settings, pixel_count: int, scene_radius: float
+) -> dict[str, Any]:
+    """Return what the kernels need to know, by the names of ``layout.PARAMS``."""
+    camera = scene.cameras[scene.camera]
+    pixel = 2.0 * math.tan(camera.fov_y / 2.0) / scene.height
+    steps = fixed_point(HEADROOM * brightest(scene), MOST_VISITS)
+    return {
+        "guide_slots": slots_of(pixel_count),
+        "guide_width": settings.guide_cell_size * pixel,
+        "guide_least": LEAST_EDGE * scene_radius,
+        "guide_most": MOST_EDGE * scene_radius,
+        "guide_share": settings.guide_share,
+        "guide_steps": steps,
+        "guide_limit": 2.0**SUM_BITS / steps / MOST_VISITS,
+    }
+
+
+def learn_limit(epoch: range) -> int:
+    """Return the first pass of the epoch that nothing is learned from."""
+    return epoch.start + min(len(epoch), LEARNED_PASSES)
+
+
+def plan(context: Context) -> StageSpec | None:
+    """Return the stage, or None if directions are not guided."""
+    if not context.on("GUIDE"):
+        return None
+    slots = slots_of(context.pixel_count)
+    uint32 = np.dtype(np.uint32)
+    sums, cells = layout.GUIDE_SUM.dtype, layout.GUIDE_CELL.dtype
+    buffers = (
+        BufferSpec("guide_keys", uint32, slots, "fingerprints of the guide's cells"),
+        BufferSpec("guide_full", uint32, buckets_of(slots), "parts of the table that are full"),
+        BufferSpec("guide_sums", sums, slots, "what the guide learns"),
+        BufferSpec("guide_cells", cells, slots, "what the guide knows"),
+    )
+    kernel = KernelSpec(
+        "freeze_guide", record_bytes=4 + sums.itemsize + cells.itemsize, lanes=False
+    )
+    return StageSpec(
+        "guide",
+        "directions are drawn by what was learned",
+        "guide.cl",
+        flags=("GUIDE",),
+        kernels=(kernel,),
+        buffers=buffers,
+        between_passes=True,
+    )
