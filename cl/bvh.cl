@@ -572,18 +572,18 @@ kernel void link_nodes(
 ///
 /// A triangle that is not finite now is not there: all NaN, outside of every box.
 ///
-/// reads   positions; nodes[0, node_count).child; blocks.id
-/// writes  blocks.v; nodes.bounds
+/// reads   positions; places[0, node_count); nodes.child; blocks.id
+/// writes  blocks.v; nodes[places].bounds
 kernel void fit_blocks(
     global const float *positions,
+    global const uint *places,
     global BvhNode *nodes,
     global TriangleBlock *blocks,
     const uint node_count)
 {
-    const uint index = get_global_id(0);
-    if (index >= node_count)
+    if (get_global_id(0) >= node_count)
         return;
-    global BvhNode *node = &nodes[index];
+    global BvhNode *node = &nodes[places[get_global_id(0)]];
     for (uint k = 0; k < NODE_LANES; ++k) {
         Box box = empty_box();
         if ((node->child[k] & LEAF_BIT) != 0) {
@@ -634,4 +634,26 @@ kernel void fit_nodes(
             node->bounds[2 * axis + 1][k] = high;
         }
     }
+}
+
+/// Sum the areas of the children's boxes of each node.  One work item a node.
+///
+/// reads   nodes
+/// writes  areas
+kernel void measure_nodes(global const BvhNode *nodes, global float *areas, const uint node_count)
+{
+    const uint index = get_global_id(0);
+    if (index >= node_count)
+        return;
+    global const BvhNode *node = &nodes[index];
+    float sum = 0.0f;
+    for (uint k = 0; k < NODE_LANES; ++k) {
+        const float x = node->bounds[1][k] - node->bounds[0][k];
+        const float y = node->bounds[3][k] - node->bounds[2][k];
+        const float z = node->bounds[5][k] - node->bounds[4][k];
+        // An empty box is inverted.
+        if (x >= 0.0f)
+            sum += x * y + y * z + z * x;
+    }
+    areas[index] = sum;
 }

@@ -14,6 +14,7 @@
 #include "common/chain.h"
 #include "common/guide.h"
 #include "common/guided.h"
+#include "common/motion.h"
 
 #define MAX_SURVIVAL 0.999f
 
@@ -163,6 +164,9 @@ kernel void shade_paths(
 #endif
 #if SEEN
     __global Seen *seen,
+#endif
+#if SEEN == 2 && MOTION
+    __global const Corners *previous,
 #endif
 #if CELLS
     __global CellVertex *vertices,
@@ -319,7 +323,11 @@ kernel void shade_paths(
     const Mask goes_on = hit & (depth < params->max_depth);
 #if SEEN
     const UInt shape = 1u + GATHER_U(surfaces, triangle, shape);
+#if SEEN == 2 && MOTION
+    const Vec3 before = previous_point(params, previous, triangle, u, v, s.p);
+#else
     const Vec3 before = s.p;
+#endif
 #if BASE
     // The others wait for the reflectance of their base.
     const Mask sees = alive & camera_ray & !goes_on;

@@ -14,6 +14,7 @@ from psf_cl.errors import DeviceError, InputError
 from psf_cl.image import AOVS
 from psf_cl.instancing import Levels, split
 from psf_cl.measure.timing import Declared
+from psf_cl.motion import corner_labels, count_moving
 from psf_cl.scene.model import (
     TEXTURE_FIELDS,
     Scene,
@@ -27,6 +28,7 @@ from psf_cl.scene.model import (
 )
 from psf_cl.settings import Settings, check_together
 from psf_cl.stages import (
+    animate,
     camera,
     cells,
     connect,
@@ -266,6 +268,7 @@ def make_plan(
         statistics=statistics,
         halves=halves,
         max_depth=settings.max_depth,
+        moving=count_moving(scene),
         triangle_count=triangles,
         instance_count=0 if levels is None else levels.instance_count,
         corner_count=corners,
@@ -278,6 +281,7 @@ def make_plan(
     )
     stages = []
     for module in (
+        animate,
         camera,
         metropolis,
         intersect,
@@ -401,7 +405,8 @@ def _few_corners(scene: Scene, triangles: int, traits: DeviceTraits) -> int:
     """Return how many distinct corners a small scene has, 0 for one that is too large to ask."""
     if triangles > traits.few_triangles:
         return 0
-    return len(few_triangles(flatten(scene).positions).corners)
+    positions, labels = flatten(scene).positions, corner_labels(scene)
+    return len(few_triangles(positions, labels=labels).corners)
 
 
 def _few(triangles: int, corners: int, traits: DeviceTraits) -> Feature:
@@ -493,6 +498,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
         "CONNECT": connected,
         "LIGHT_SAMPLING": _light_sampling(settings, bool(connected.value), _light_count(scene)),
         "LENS": _lens(scene),
+        "MOTION": _motion(scene),
         "AOV_DIRECT": switch(
             bool(outputs & {"direct", "indirect"}),
             "direct or indirect was asked for",
@@ -520,6 +526,14 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "integrator is path",
         ),
     }
+
+
+def _motion(scene: Scene) -> Feature:
+    """Return whether triangles move between frames."""
+    moving = count_moving(scene)
+    if moving is None:
+        return Feature(0, "no triangle moves")
+    return Feature(1, f"{moving.triangles} triangles move between frames")
 
 
 def _lens(scene: Scene) -> Feature:
@@ -586,6 +600,8 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     if features["METROPOLIS"].value:
         names = ("AOV_DIRECT", "AOV_FEATURES", "BASE", "CELLS", "SEEN")
         full |= {name: features[name] for name in names}
+    # Without anything to move there is nothing to hold.
+    full["MOTION"] = features["MOTION"]
     return full
 
 

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from psf_cl import __version__, tables
+from psf_cl import __version__, motion, tables
 from psf_cl.chains import Chains
 from psf_cl.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from psf_cl.device import layout
-from psf_cl.device.bvh import MIN_STACK_SIZE, Bvh, build_bvh, warm_up_builder
+from psf_cl.device.bvh import MIN_STACK_SIZE, Bvh, Refit, build_bvh, warm_up_builder
 from psf_cl.device.device import Buffer, Device, open_device
 from psf_cl.device.light_tree import LightTree, warm_up_light_tree
 from psf_cl.device.program import Launch, Program, load_program
@@ -30,7 +30,9 @@ from psf_cl.errors import DeviceError, InputError, NoRoomError
 from psf_cl.image import Image
 from psf_cl.instancing import Placed, place
 from psf_cl.measure.errors import error_of_halves
+from psf_cl.mover import Mover
 from psf_cl.plan import Plan, Room, make_plan
+from psf_cl.scene import animation
 from psf_cl.scene.digest import scene_digest
 from psf_cl.scene.far import far_from_origin, moved
 from psf_cl.scene.load import load_scene
@@ -46,6 +48,9 @@ LOOKS_PER_CENSUS = 8
 #: Share of the bytes that a device had no room for with which the next attempt is made.
 LESS_ROOM = 0.7
 
+#: Cost of the tree, relative to when it was built, from which on another one is built.
+REBUILD_RATIO = 1.25
+
 #: Passes before the error is estimated for the first time, and the ratio from then on.
 FIRST_ESTIMATE = 16
 ESTIMATE_STEP = 1.25
@@ -56,6 +61,7 @@ class Renderer:
 
     Args:
         outputs: AOVs to deliver besides the image (``psf_cl.plan.AOVS``).
+        time: s, of the first frame of a scene that moves.
         statistics: whether to measure stages (if ``device`` profiles) and occupancy for ``stats``.
         halves: whether to sum half of the passes apart, which ``estimated_error`` needs.
         crop: (x, y, width, height) in pixels, or None for the whole film.
@@ -78,9 +84,13 @@ class Renderer:
         full: bool = False,
         halves: bool = False,
         room: Room | None = None,
+        time: float = 0.0,
     ) -> None:
         self.far = far_from_origin(scene)
-        self.scene = scene = scene if self.far is None else moved(scene, -self.far)
+        scene = scene if self.far is None else moved(scene, -self.far)
+        self.moving = scene
+        self.scene = animation.shaped(scene, time)
+        self.time = time
         self.settings = settings or resolve(scene.render, scene.path)
         if not scene.cameras:
             raise InputError(f"{scene.path}: no camera")
@@ -104,6 +114,9 @@ class Renderer:
         self.censuses = 0
         self.programs: dict[str, Program] = {}
         self.depth_counts = np.zeros(film.CENSUS_BINS)
+        self.refit: Refit | None = None
+        self.light_tree: LightTree | None = None
+        self.rebuilds = 0
         self.buffers: dict[str, Buffer] = {}
         try:
             self._set_up(plan_for)
@@ -153,11 +166,13 @@ class Renderer:
         self.load_seconds = time.perf_counter() - start
         self.build_seconds = 0.0
         self.bvh: Bvh | None = None
+        self.mover: Mover | None = None
+        if self.plan.features["MOTION"].value:
+            self._set_moving(geometry, self.few)
         if not self.plan.features["FEW"].value:
             self.compile_seconds += warm_up_builder(self.device)
             start = time.perf_counter()
-            self.bvh = self._build_bvh(geometry)
-            self.dropped_triangles = self.bvh.dropped
+            self._build_bvh(geometry)
             self.build_seconds = time.perf_counter() - start
         if self.plan.features["LIGHT_SAMPLING"].value:
             self._build_light_tree(geometry)
@@ -204,13 +219,16 @@ class Renderer:
     def _between(self, start: int) -> None:
         """Do what the paths of an epoch need that begins with pass ``start``."""
         if self.freeze_guide is not None:
-            epoch = range(start, doubling_epoch(start, self.plan.shortest_epoch))
+            first = self.scheduler.first
+            end = first + doubling_epoch(start - first, self.plan.shortest_epoch)
+            epoch = range(start, end)
             self.freeze_guide.set(fades=int(0 < start <= guide.FADING_PASSES))
             self.freeze_guide(guide.slots_of(self.plan.pixel_count), film.GROUP)
             value = np.array([guide.learn_limit(epoch)], np.uint32)
             self.device.write(self.buffers["counters"], value, layout.COUNTER_INDEX["learn_limit"])
         if self.chains is not None:
-            self.chains.measure() if start else self.chains.start()
+            is_first = start == self.scheduler.first
+            self.chains.start() if is_first else self.chains.measure()
 
     # Frames.
 
@@ -233,11 +251,17 @@ class Renderer:
             if whole:
                 self._keep_history()
             self._empty(first)
-            values = tables.camera_values(
-                self.scene.cameras[self.scene.camera], self.scene.width, self.scene.height
-            )
+            self.time, self.scene = time, animation.posed(self.moving, time)
+            values = self._camera_values()
             before = self.params[0].copy()
             values |= {new: before[name] for new, name in tables.PREVIOUS_CAMERA.items()}
+            if self.mover is not None:
+                self.mover.move(time)
+                values["scene_radius"] = max(self.radius, self.mover.radius(self.center))
+                if self.mover.moved:
+                    self._fit_tree()
+            if self.lights_change:
+                self._change_lights()
             values["history_flags"] = self._history_flags(before, values) if whole else 0
             self._set_params(values | {"first_pass": first})
             self.device.wait()
@@ -260,8 +284,37 @@ class Renderer:
         )
         flags = constants["HISTORY_THERE"]
         if same_view:
-            flags |= constants["HISTORY_SAME_VIEW"] | constants["HISTORY_STILL"]
+            flags |= constants["HISTORY_SAME_VIEW"]
+            if self.mover is None or not self.mover.moved:
+                flags |= constants["HISTORY_STILL"]
         return flags
+
+    def _fit_tree(self) -> None:
+        """Fit the tree to where triangles are now; build another if it has become too slow."""
+        if self.bvh is None or self.refit is None:
+            return
+        self.refit.fit(self.buffers["positions"])
+        if self.refit.cost_ratio() <= REBUILD_RATIO:
+            return
+        old, size = self.bvh, self.bvh.stack_size
+        self._build_bvh(None)
+        self.rebuilds += 1
+        if self.bvh.stack_size > size:
+            self.programs = self._compile(self.bvh.stack_size)
+        self._bind(self.programs)
+        self.device.release(old.nodes, old.blocks)
+
+    def _change_lights(self) -> None:
+        """Write the light table and the materials anew, by what shines now and where."""
+        self.lights = motion.lights_at(
+            self.moving, self.time, self.settings.light_sampling, self.radius, self.lights
+        )
+        if "lights" in self.buffers and len(self.lights):
+            self.device.write(self.buffers["lights"], self.lights)
+        self.device.write(self.buffers["materials"], tables.material_table(self.scene.materials))
+        if self.light_tree is not None:
+            self.light_tree.launch.set(near_share=tables.near_share(self.lights))
+            self.light_tree.fit()
 
     def _empty(self, first: int) -> None:
         """Leave no path in the pool and no sample in the film; ``first`` is the next pass."""
@@ -577,6 +630,7 @@ class Renderer:
                 "nodes": self.bvh.node_count,
                 "blocks": self.bvh.block_count,
                 "depth": self.bvh.depth,
+                "rebuilds": self.rebuilds,
             },
             "settings": {
                 name: getattr(self.settings, name) for name in self.settings.__dataclass_fields__
@@ -670,9 +724,18 @@ class Renderer:
         )
         few = None
         if self.plan.features["FEW"].value:
-            few = tables.few_triangles(geometry.positions, geometry.cut_out)
+            labels = motion.corner_labels(self.moving)
+            few = tables.few_triangles(geometry.positions, geometry.cut_out, labels)
         self.dropped_triangles = few.dropped if few else 0
+        self.few = few
+        self.surfaces = geometry.surfaces
+        if self.placed is not None:
+            self.surfaces = self.surfaces[: self.placed.starts[1]]
+        self.off_surfaces: tuple[np.ndarray, np.ndarray] | None = None
         self.params = self._params(geometry, few, lights)
+        self.center, self.radius = geometry.center, geometry.radius
+        self.cut_out = geometry.cut_out
+        self.lights_change = motion.lights_change(self.moving)
 
         def or_zeros(table: np.ndarray | None, record: layout.Record) -> np.ndarray:
             return np.zeros(geometry.count, record.dtype) if table is None else table
@@ -702,6 +765,19 @@ class Renderer:
                 self.buffers[name] = self.device.upload(name, content())
         return geometry
 
+    def _camera_values(self) -> dict[str, Any]:
+        """Return where the camera is, off the surfaces of the first frame."""
+        scene = self.scene
+        camera = scene.cameras[scene.camera]
+        values = tables.camera_values(camera, scene.width, scene.height)
+        if self.off_surfaces is None or not np.array_equal(self.off_surfaces[0], camera.transform):
+            origin = tables.off_surfaces(
+                values["camera_origin"], values["camera_forward"], self.surfaces
+            )
+            self.off_surfaces = camera.transform, origin
+        values["camera_origin"] = self.off_surfaces[1]
+        return values
+
     def _params(
         self,
         geometry: tables.Geometry,
@@ -710,13 +786,7 @@ class Renderer:
     ) -> np.ndarray:
         scene, settings = self.scene, self.settings
         params = np.zeros(1, layout.PARAMS.dtype)
-        values: dict[str, Any] = tables.camera_values(
-            scene.cameras[scene.camera], scene.width, scene.height
-        )
-        in_world = slice(None if self.placed is None else self.placed.starts[1])
-        values["camera_origin"] = tables.off_surfaces(
-            values["camera_origin"], values["camera_forward"], geometry.surfaces[in_world]
-        )
+        values: dict[str, Any] = self._camera_values()
         image = scene.environment.image
         values |= {
             "width": scene.width,
@@ -746,6 +816,8 @@ class Renderer:
             "direct_sampling": layout.CONSTANT[f"DIRECT_{settings.direct_sampling.upper()}"],
             "sampler": layout.CONSTANT[f"SAMPLER_{settings.sampler.upper()}"],
         }
+        moving = motion.count_moving(self.moving)
+        values["first_moving"] = geometry.count - (moving.triangles if moving else 0)
         # There is no frame before the first: nothing has moved.
         values |= {new: values[name] for new, name in tables.PREVIOUS_CAMERA.items()}
         values |= cells.parameters(scene, settings, self.plan.pixel_count)
@@ -757,22 +829,43 @@ class Renderer:
             params[0][name] = value
         return params
 
-    def _build_bvh(self, geometry: tables.Geometry) -> Bvh:
+    def _set_moving(self, geometry: tables.Geometry, few: tables.Few | None) -> None:
+        """Put what moves where it is in the first frame."""
+        if "positions" in self.buffers:
+            self.device.write(self.buffers["positions"], geometry.positions.reshape(-1))
+        stage = next(stage for stage in self.plan.stages if stage.per_frame)
+        labels = few.vertices if few is not None else None
+        self.mover = Mover(self.device, self.moving, self.buffers, self.plan.defines(stage), labels)
+        self.mover.move(self.time)
+
+    def _build_bvh(self, geometry: tables.Geometry | None) -> None:
+        """Build the tree; without ``geometry`` over the positions that are on the device."""
         device = self.device
         if self.placed is not None:
-            return self._build_levels(self.placed)
-        inputs = [device.upload("positions", geometry.positions.reshape(-1))]
+            self._build_levels(self.placed)
+            return
+        inputs = []
         try:
+            positions = self.buffers.get("positions")
+            if positions is None:
+                positions = device.upload("positions", geometry.positions.reshape(-1))
+                inputs.append(positions)
+            flags = None
             if self.plan.features["ALPHA"].value:
-                flags = geometry.cut_out.astype(np.uint32)
-                inputs.append(device.upload("alpha_flags", flags))
-            bvh = build_bvh(device, inputs[0], geometry.count, *inputs[1:])
+                flags = device.upload("alpha_flags", self.cut_out.astype(np.uint32))
+                inputs.append(flags)
+            self.bvh = bvh = build_bvh(device, positions, len(self.cut_out), flags)
         finally:
             device.release(*inputs)
         self.buffers |= {"nodes": bvh.nodes, "blocks": bvh.blocks}
-        return bvh
+        self.dropped_triangles = bvh.dropped
+        if self.refit is not None:
+            self.refit.release()
+            self.refit = None
+        if self.mover is not None:
+            self.refit = Refit(device, bvh, self.mover.tables.first_triangle)
 
-    def _build_levels(self, placed: Placed) -> Bvh:
+    def _build_levels(self, placed: Placed) -> None:
         """Build the trees of a scene of two levels, and tell its instances where theirs begin."""
         cuts = placed.starts[1:-1]
         cut_out = None
@@ -788,7 +881,7 @@ class Renderer:
         self.buffers |= {"nodes": bvh.nodes, "blocks": bvh.blocks}
         placed.instances["root"] = roots[placed.part_of]
         self.buffers["instances"] = self.device.upload("instances", placed.instances)
-        return bvh
+        self.bvh, self.dropped_triangles = bvh, bvh.dropped
 
     def _build_light_tree(self, geometry: tables.Geometry) -> None:
         self.compile_seconds += warm_up_light_tree(self.device)
@@ -806,6 +899,8 @@ class Renderer:
         start = time.perf_counter()
         programs = {}
         for stage in self.plan.stages:
+            if stage.per_frame:
+                continue
             defines = self.plan.defines(stage)
             if stage.traces:
                 defines |= {"STACK_SIZE": stack_size}
@@ -822,7 +917,7 @@ class Renderer:
                 -(-traits.slots // kernel.paths_per_item(traits)),
             )
             for stage in self.plan.stages
-            if not stage.per_pass and not stage.between_passes
+            if not (stage.per_pass or stage.between_passes or stage.per_frame)
             for kernel in stage.kernels
         ]
         self._bind_cells(programs.get("cells"))

@@ -168,25 +168,29 @@ def _corner_records(
     return table
 
 
-def _world_tangents(scene: Scene, shape: Shape) -> list[np.ndarray]:
-    """Return direction and sign at each triangle's corners, three times ``(m, 4)``.
+def object_tangents(scene: Scene, shape: Shape) -> list[np.ndarray]:
+    """Return direction and sign at each triangle's corners, in the mesh's space, three ``(m, 4)``.
 
     Those of the mesh, or derived from the coordinates of the normal map: zero where there are none.
     """
     mesh, material = shape.mesh, scene.materials[shape.material]
-    linear = shape.transform[:3, :3]
     if mesh.tangents is not None:
-        at_corners = [mesh.tangents[mesh.triangles[:, corner]] for corner in range(3)]
-    else:
-        index = max(material.normal_texture, material.anisotropy_texture)
-        texture = scene.textures[index] if index >= 0 else None
-        uvs = mesh.uvs1 if texture is not None and texture.uv_set else mesh.uvs
-        if uvs is None:
-            return [np.zeros((len(mesh.triangles), 4))] * 3
-        if texture is not None:
-            matrix = np.reshape(texture.transform, (2, 3))
-            uvs = uvs @ matrix[:, :2].T
-        at_corners = derived_tangents(mesh, uvs)
+        return [mesh.tangents[mesh.triangles[:, corner]] for corner in range(3)]
+    index = max(material.normal_texture, material.anisotropy_texture)
+    texture = scene.textures[index] if index >= 0 else None
+    uvs = mesh.uvs1 if texture is not None and texture.uv_set else mesh.uvs
+    if uvs is None:
+        return [np.zeros((len(mesh.triangles), 4))] * 3
+    if texture is not None:
+        matrix = np.reshape(texture.transform, (2, 3))
+        uvs = uvs @ matrix[:, :2].T
+    return derived_tangents(mesh, uvs)
+
+
+def _world_tangents(scene: Scene, shape: Shape) -> list[np.ndarray]:
+    """Return direction and sign at each triangle's corners in the world, three ``(m, 4)``."""
+    linear = shape.transform[:3, :3]
+    at_corners = object_tangents(scene, shape)
     sign = -1.0 if np.linalg.det(linear) < 0 else 1.0
     world = []
     for values in at_corners:
@@ -274,27 +278,39 @@ class Few:
         corners: ``(n, 3)`` float32, no two equal; world, m.
         faces: ``(m, 4)`` uint32, three corners and the triangle's index (with ALPHA_BIT).
         dropped: triangles left out because a coordinate is not finite.
+        vertices: ``(n,)`` int64, the label of each corner that moves, -1 for the others.
     """
 
     corners: np.ndarray
     faces: np.ndarray
     dropped: int
+    vertices: np.ndarray
 
 
-def few_triangles(positions: np.ndarray, cut_out: np.ndarray | None = None) -> Few:
+def few_triangles(
+    positions: np.ndarray, cut_out: np.ndarray | None = None, labels: np.ndarray | None = None
+) -> Few:
     """Return the triangles ``(n, 9)`` as indices into their distinct corners.
 
     Args:
         cut_out: ``(n,)`` bool, those whose alpha must be looked up; their index has ALPHA_BIT.
+        labels: ``(n, 3)`` int64, numbers from 0 of corners that move, the same for those that stay
+            together; -1 for the others.
     """
     finite = np.flatnonzero(np.isfinite(positions).all(axis=1))
     # Adding 0 makes -0 the same corner as 0.
     points = positions[finite].reshape(-1, 3) + np.float32(0.0)
-    corners, index = np.unique(points, axis=0, return_inverse=True)
+    label = np.full(len(points), -1) if labels is None else labels[finite].reshape(-1)
+    # Where corners are that move says nothing of which they are.
+    known = np.where(label[:, None] >= 0, 0.0, points.astype(np.float64))
+    _, first, index = np.unique(
+        np.column_stack([label, known]), axis=0, return_index=True, return_inverse=True
+    )
     faces = np.concatenate([index.reshape(-1, 3), finite[:, None]], axis=1).astype(np.uint32)
     if cut_out is not None:
         faces[cut_out[finite], 3] |= np.uint32(layout.CONSTANT["ALPHA_BIT"])
-    return Few(corners.astype(np.float32), faces, len(positions) - len(finite))
+    dropped = len(positions) - len(finite)
+    return Few(points[first].astype(np.float32), faces, dropped, label[first])
 
 
 def material_table(materials: tuple[Material, ...]) -> np.ndarray:
@@ -458,6 +474,10 @@ def light_table(scene: Scene, geometry: Geometry, sampling: str) -> np.ndarray:
     sound = (
         np.isfinite(area) & (area > 1e-30) & np.isfinite(geometry.positions[triangles]).all(axis=1)
     )
+    if scene.nodes:
+        # What moves keeps its place in the table, though it gives no light while it has no area.
+        area = np.where(sound, area, 0.0)
+        sound[:] = True
     triangles, area = triangles[sound], area[sound]
 
     sky = has_environment(scene.environment)

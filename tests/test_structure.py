@@ -22,7 +22,7 @@ ROWS = [
     {"errors", "files", "settings", "traits", "image", "checkpoint", "__version__", ""},
     {"scene", "measure"},
     {"device"},
-    {"stages", "tables", "instancing"},
+    {"stages", "tables", "instancing", "motion", "mover"},
     {"chains", "plan", "scheduler"},
     {"renderer"},
     {"cli"},

@@ -46,6 +46,9 @@
 #ifndef LENS
 #error "LENS must be 0 (a pinhole), 1 (a lens) or 2 (parallel rays)"
 #endif
+#ifndef MOTION
+#error "MOTION must be 0 or 1"
+#endif
 #ifndef AOV_DIRECT
 #error "AOV_DIRECT must be 0 or 1"
 #endif

@@ -5,6 +5,7 @@
 #define ALPHA_BIT 0x80000000u // id[] needs its alpha looked up
 #define NO_HIT 0xFFFFFFFFu
 #define NO_LIGHT 0xFFFFFFFFu
+#define NO_VERTEX 0xFFFFFFFFu // it does not move
 #define NO_TEXTURE 0xFFFFFFFFu
 #define OWN_MATERIAL 0xFFFFFFFFu // each triangle has its own
 #define MATERIAL_TWO_SIDED_EMISSION 1u
@@ -244,6 +245,7 @@ typedef struct {
     uint temporal_rule; // RULE_OFF, RULE_EXPONENTIAL, RULE_CUMULATIVE or RULE_ADAPTIVE
     float temporal_alpha; // weight of a frame, by the exponential rule
     uint history_flags; // HISTORY_THERE, HISTORY_STILL, HISTORY_SAME_VIEW
+    uint first_moving; // the first triangle that moves: all after it do
     uint first_pass; // of this frame; passes are counted on from frame to frame
     float previous_origin[3]; // of the camera of the frame before; world, m
     float previous_right[3]; // unit, world
@@ -263,6 +265,7 @@ typedef struct {
     float guide_share; // of the directions of a diffuse lobe that the guide draws
     float guide_steps; // fixed-point steps of a sum of its radiance per unit, a power of two
     float guide_limit; // radiance from which a sample is too large for these sums
+    uint pad[3]; // fills the record
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.
@@ -314,6 +317,40 @@ typedef struct {
     float mirroring; // -1 if the mesh is mirrored, else 1
     uint pad[6]; // fills the record
 } Instance;
+
+/// A vertex that moves, in its own space.
+typedef struct {
+    float p[3]; // m
+    uint first_delta; // of its morph targets
+    float n[3]; // unit shading normal; zero if it is flat
+    uint delta_count; // morph targets
+    float t[4]; // tangent and sign; zero if it has none
+} RestVertex;
+
+/// What a morph target adds to a vertex, times its weight.
+typedef struct {
+    float p[3]; // m
+    uint weight; // index into the weights
+    float n[3]; // of the normal
+    float pad0; // fills the word
+    float t[3]; // of the tangent
+    float pad1; // fills the record
+} MorphDelta;
+
+/// A vertex where it is in this frame.
+typedef struct {
+    float p[3]; // world, m
+    float side; // -1 if it is mirrored, else 1
+    float n[3]; // unit shading normal; zero if it has none
+    float pad; // fills the word
+    float t[4]; // unit tangent and sign
+} MovedVertex;
+
+/// Where the corners of a triangle that moves were in the frame before.
+typedef struct {
+    float p[9]; // corner * 3 + axis; world, m
+    float pad[3]; // fills the record
+} Corners;
 
 /// Shading normals of a triangle's corners; all zero if it is flat.
 typedef struct {

@@ -189,6 +189,9 @@ def add_frame_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fps", metavar="F", type=positive_number, default=24.0, help="frames a second (24)"
     )
+    parser.add_argument(
+        "--clip", metavar="NAME", help="the animation of a glTF file to play, by name or number"
+    )
 
 
 def room_of(args: argparse.Namespace) -> Room | None:
@@ -196,6 +199,11 @@ def room_of(args: argparse.Namespace) -> Room | None:
     from psf_cl.plan import Room
 
     return None if args.memory is None else Room(args.memory << 20)
+
+
+def first_time(args: argparse.Namespace) -> dict[str, float]:
+    """Return the time of the first frame as an argument of ``Renderer``; none for one image."""
+    return {"time": args.frames.start / args.fps} if args.frames else {}
 
 
 def load_with_settings(args: argparse.Namespace) -> tuple[Scene, Settings]:
@@ -206,7 +214,11 @@ def load_with_settings(args: argparse.Namespace) -> tuple[Scene, Settings]:
     """
     from psf_cl.scene.load import load_scene
 
-    scene = load_scene(args.scene, environment=args.environment, camera=args.camera, size=args.size)
+    # Only a sequence reads what moves.
+    motion = {"moving": True, "clip": args.clip} if getattr(args, "frames", None) else {}
+    scene = load_scene(
+        args.scene, environment=args.environment, camera=args.camera, size=args.size, **motion
+    )
     settings = resolve(scene.render, scene.path, args.preset, dict(args.settings))
     if args.seed is not None:
         settings = settings.with_values({"seed": args.seed}, "--")

@@ -5,7 +5,14 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from psf_cl.cli.common import add_scene_arguments, load_with_settings, room_of, show, tell_notes
+from psf_cl.cli.common import (
+    add_frame_arguments,
+    add_scene_arguments,
+    load_with_settings,
+    room_of,
+    show,
+    tell_notes,
+)
 
 if TYPE_CHECKING:
     from psf_cl.plan import Plan
@@ -17,6 +24,7 @@ def add_parser(commands: Any) -> None:
         "plan", help="show what a render would run and leave out; needs no OpenCL"
     )
     add_scene_arguments(parser)
+    add_frame_arguments(parser)
     parser.add_argument(
         "--kind", choices=("cpu", "gpu"), default="cpu", help="of device to plan for (default cpu)"
     )

@@ -23,6 +23,7 @@ from psf_cl.cli.common import (
     check_distinct,
     exposure_argument,
     file_argument,
+    first_time,
     load_with_settings,
     positive_integer,
     positive_number,
@@ -160,6 +161,7 @@ def run(args: argparse.Namespace) -> int:
         crop=args.crop,
         statistics=statistics,
         halves=args.noise is not None,
+        **first_time(args),
         room=room_of(args),
     )
     if args.resume:

@@ -152,33 +152,71 @@ class Refit:
 
     Triangles that were dropped from the tree stay out of it; one that is not finite now is not hit
     until it is finite again.
+
+    Args:
+        first_moving: the first triangle that may move; nodes over none that does are left alone.
     """
 
-    def __init__(self, device: Device, bvh: Bvh) -> None:
+    def __init__(self, device: Device, bvh: Bvh, first_moving: int = 0) -> None:
         self.device = device
         self.bvh = bvh
         nodes = device.read(bvh.nodes, bvh.node_count)
-        self.built_cost = visit_cost(nodes)
         levels = [np.zeros(1, np.uint32)]
         while len(levels[-1]):
             children = nodes["child"][levels[-1]].reshape(-1)
             levels.append(children[(children != 0) & (children < CONSTANT["LEAF_BIT"])])
+        levels.pop()
+        if first_moving > 0:
+            levels = self._moving_levels(nodes["child"], levels, first_moving)
         self.places = device.upload("places", np.concatenate(levels))
-        self.levels = _level_ranges([len(level) for level in levels[:-1]])
+        self.areas = device.allocate("areas", np.float32, bvh.node_count)
+        self.levels = _level_ranges([len(level) for level in levels])
         self.program = _load(device, bvh.width)
+        self.built_cost = self._cost()
+
+    def _moving_levels(
+        self, children: np.ndarray, levels: list[np.ndarray], first_moving: int
+    ) -> list[np.ndarray]:
+        """Return the nodes of each level below which there is a triangle from ``first_moving``."""
+        ids = self.device.read(self.bvh.blocks, self.bvh.block_count)["id"]
+        used = ids != CONSTANT["NO_HIT"]
+        moves = ids & ~np.uint32(CONSTANT["ALPHA_BIT"]) >= first_moving
+        moving_blocks = (used & moves).any(axis=1)
+        leaf = np.uint32(CONSTANT["LEAF_BIT"])
+        moving = np.zeros(len(children), bool)
+        for level in reversed(levels):
+            below = children[level]
+            is_leaf = below >= leaf
+            blocks = moving_blocks[np.where(is_leaf, below & ~leaf, 0)]
+            inner = moving[np.where(is_leaf, 0, below)] & (below != 0)
+            moving[level] = np.where(is_leaf, blocks, inner).any(axis=1)
+        return [level[moving[level]] for level in levels]
 
     def release(self) -> None:
         """Give back what is the refit's own; the tree stays."""
-        self.device.release(self.places)
+        self.device.release(self.places, self.areas)
 
     def fit(self, positions: Buffer) -> None:
         """Enqueue fitting the tree to ``positions``, of the same triangles as it was built from."""
         _fit(self.program, self.bvh, self.places, self.levels, positions)
 
     def cost_ratio(self) -> float:
-        """Return by how much the moves have made a ray dearer; from 1.3 on a new tree may pay."""
-        nodes = self.device.read(self.bvh.nodes, self.bvh.node_count)
-        return visit_cost(nodes) / self.built_cost
+        """Return by how much the moves have made a ray dearer, by surfaces: 1 when it was built."""
+        return self._cost() / self.built_cost
+
+    def _cost(self) -> float:
+        """Return ``visit_cost`` of the tree as it is now."""
+        count = self.bvh.node_count
+        launch = self.program.bind(
+            "measure_nodes", nodes=self.bvh.nodes, areas=self.areas, node_count=count
+        )
+        launch(count, group=_GROUP)
+        root = self.device.read(self.bvh.nodes, 1)
+        low, high = root["bounds"][0, ::2].min(axis=1), root["bounds"][0, 1::2].max(axis=1)
+        x, y, z = np.maximum(high.astype(np.float64) - low, 0.0)
+        whole = x * y + y * z + z * x
+        total = float(self.device.read(self.areas, count).sum(dtype=np.float64))
+        return 1.0 + total / whole if 0.0 < whole < np.inf else 1.0
 
 
 def _load(device: Device, width: int) -> Program:
@@ -203,13 +241,15 @@ def _fit(
         places: uint32, the nodes level by level.
         levels: where in ``places`` each level starts, and how many nodes it has.
     """
+    count = sum(size for _, size in levels)
     program.bind(
         "fit_blocks",
         positions=positions,
+        places=places,
         nodes=bvh.nodes,
         blocks=bvh.blocks,
-        node_count=bvh.node_count,
-    )(bvh.node_count, group=_GROUP)
+        node_count=count,
+    )(count, group=_GROUP)
     launch = program.bind("fit_nodes", places=places, nodes=bvh.nodes, level_start=0, level_count=0)
     # The last level has no inner children.
     for start, count in reversed(levels[:-1]):
@@ -341,7 +381,14 @@ class TreeBuild:
             dropped=self.scalars["triangle_count"] - self.scalars["count"],
             width=self.width,
         )
-        _fit(self.program, bvh, self.own["places"], levels, self.positions)
+        # There is a root also of no triangles.
+        _fit(
+            self.program,
+            bvh,
+            self.own["places"],
+            levels or [(0, 1)],
+            self.positions,
+        )
         self.device.wait()
         del self.own["nodes"], self.own["blocks"]
         return bvh

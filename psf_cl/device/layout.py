@@ -112,6 +112,7 @@ PARAMS = Record(
     uint temporal_rule - RULE_OFF, RULE_EXPONENTIAL, RULE_CUMULATIVE or RULE_ADAPTIVE
     float temporal_alpha - weight of a frame, by the exponential rule
     uint history_flags - HISTORY_THERE, HISTORY_STILL, HISTORY_SAME_VIEW
+    uint first_moving - the first triangle that moves: all after it do
     uint first_pass - of this frame; passes are counted on from frame to frame
     float previous_origin[3] - of the camera of the frame before; world, m
     float previous_right[3] - unit, world
@@ -196,6 +197,52 @@ INSTANCE = Record(
     float inverse[9] - from the world to the mesh, without position, row by row
     float mirroring - -1 if the mesh is mirrored, else 1
     uint pad[6] - fills the record
+    """),
+)
+
+REST_VERTEX = Record(
+    "RestVertex",
+    "A vertex that moves, in its own space.",
+    _fields("""
+    float p[3] - m
+    uint first_delta - of its morph targets
+    float n[3] - unit shading normal; zero if it is flat
+    uint delta_count - morph targets
+    float t[4] - tangent and sign; zero if it has none
+    """),
+)
+
+MORPH_DELTA = Record(
+    "MorphDelta",
+    "What a morph target adds to a vertex, times its weight.",
+    _fields("""
+    float p[3] - m
+    uint weight - index into the weights
+    float n[3] - of the normal
+    float pad0 - fills the word
+    float t[3] - of the tangent
+    float pad1 - fills the record
+    """),
+)
+
+MOVED_VERTEX = Record(
+    "MovedVertex",
+    "A vertex where it is in this frame.",
+    _fields("""
+    float p[3] - world, m
+    float side - -1 if it is mirrored, else 1
+    float n[3] - unit shading normal; zero if it has none
+    float pad - fills the word
+    float t[4] - unit tangent and sign
+    """),
+)
+
+CORNERS = Record(
+    "Corners",
+    "Where the corners of a triangle that moves were in the frame before.",
+    _fields("""
+    float p[9] - corner * 3 + axis; world, m
+    float pad[3] - fills the record
     """),
 )
 
@@ -501,6 +548,10 @@ RECORDS = (
     BINARY_NODE,
     SURFACE,
     INSTANCE,
+    REST_VERTEX,
+    MORPH_DELTA,
+    MOVED_VERTEX,
+    CORNERS,
     NORMALS,
     UVS,
     VERTEX_COLORS,
@@ -687,6 +738,7 @@ CONSTANTS = (
     ("ALPHA_BIT", 0x80000000, "id[] needs its alpha looked up"),
     ("NO_HIT", 0xFFFFFFFF, ""),
     ("NO_LIGHT", 0xFFFFFFFF, ""),
+    ("NO_VERTEX", 0xFFFFFFFF, "it does not move"),
     ("NO_TEXTURE", 0xFFFFFFFF, ""),
     ("OWN_MATERIAL", 0xFFFFFFFF, "each triangle has its own"),
     ("MATERIAL_TWO_SIDED_EMISSION", 1, ""),

@@ -124,14 +124,17 @@ class Program:
         """
         return Launch(self, kernel, arguments)
 
-    def bind_planned(self, kernel: str, buffers: Mapping[str, Buffer]) -> Launch:
+    def bind_planned(
+        self, kernel: str, buffers: Mapping[str, Buffer], **scalars: int | float
+    ) -> Launch:
         """Return a launch of ``kernel`` whose arguments are the ``buffers`` of the same names.
 
         Raises:
             TypeError: the kernel wants something that is not among them.
         """
         names = [name for name, _, _ in parameters_of(cl.Kernel(self.program, kernel))]
-        return self.bind(kernel, **{name: buffers[name] for name in names if name in buffers})
+        given = {name: buffers[name] for name in names if name in buffers}
+        return self.bind(kernel, **given, **scalars)
 
 
 def parameters_of(kernel: cl.Kernel) -> list[tuple[str, str, bool]]:

@@ -92,9 +92,7 @@ def posed(scene: Scene, time: float | None) -> Scene:
     """
     if not (scene.nodes or is_animated(scene)):
         return scene
-    world = world_transforms(scene.nodes, time)
-    if not np.isfinite(world).all():
-        raise InputError(f"{scene.path}: a transform is not finite {_when(time)}")
+    world = checked_transforms(scene, time)
     return replace(
         scene,
         shapes=tuple(_posed_shape(shape, world) for shape in scene.shapes),
@@ -102,6 +100,18 @@ def posed(scene: Scene, time: float | None) -> Scene:
         lights=tuple(_posed_light(scene, light, world, time) for light in scene.lights),
         materials=tuple(_posed_material(material, time) for material in scene.materials),
     )
+
+
+def checked_transforms(scene: Scene, time: float | None) -> np.ndarray:
+    """Return ``world_transforms`` of a scene's nodes.
+
+    Raises:
+        InputError: one is not finite.
+    """
+    world = world_transforms(scene.nodes, time)
+    if not np.isfinite(world).all():
+        raise InputError(f"{scene.path}: a transform is not finite {_when(time)}")
+    return world
 
 
 def _when(time: float | None) -> str:
@@ -197,6 +207,14 @@ def baked(scene: Scene, time: float | None) -> Scene:
     )
 
 
+def shaped(scene: Scene, time: float | None) -> Scene:
+    """Return ``posed`` with its vertices moved too; what moves still knows that it does."""
+    at = posed(scene, time)
+    world = world_transforms(scene.nodes, time)
+    shapes = (replace(shape, mesh=deformed(at, shape, world, time)) for shape in at.shapes)
+    return replace(at, shapes=tuple(shapes)) if scene.nodes else at
+
+
 def settled(scene: Scene) -> Scene:
     """Return ``scene`` with everything baked that never moves, and the shapes that do move last.
 
@@ -225,7 +243,7 @@ def deformed(scene: Scene, shape: Shape, world: np.ndarray, time: float | None) 
     mesh = shape.mesh
     if mesh.morphs is None and shape.skin is None:
         return mesh
-    positions = mesh.positions.astype(np.float64)
+    positions, triangles = mesh.positions.astype(np.float64), mesh.triangles
     normals = None if mesh.normals is None else mesh.normals.astype(np.float64)
     tangents = None if mesh.tangents is None else mesh.tangents.astype(np.float64)
     if mesh.morphs is not None:
@@ -241,6 +259,9 @@ def deformed(scene: Scene, shape: Shape, world: np.ndarray, time: float | None) 
             share = mesh.weights[:, column, None, None].astype(np.float64)
             blended += share * matrices[mesh.joints[:, column]]
         linear = blended[:, :, :3]
+        # Where joints mirror, corners go round the other way; the front stays the front.
+        mirrored = np.linalg.det(linear)[mesh.triangles[:, 0]] < 0.0
+        triangles = np.where(mirrored[:, None], triangles[:, [0, 2, 1]], triangles)
         positions = np.einsum("nij,nj->ni", linear, positions) + blended[:, :, 3]
         if normals is not None:
             normals = np.einsum("nij,nj->ni", cofactors(linear), normals)
@@ -249,6 +270,7 @@ def deformed(scene: Scene, shape: Shape, world: np.ndarray, time: float | None) 
     return replace(
         mesh,
         positions=positions.astype(np.float32),
+        triangles=triangles,
         normals=None if normals is None else _unit(normals).astype(np.float32),
         tangents=None if tangents is None else tangents.astype(np.float32),
         morphs=None,

@@ -55,6 +55,12 @@ class Curve:
         steps = np.linspace(self.times[:-1], self.times[1:], 17).ravel()
         return np.max([self.at(time) for time in [self.times[0], *steps]], axis=0)
 
+    def moved(self, by: np.ndarray) -> Curve:
+        """Return the curve with ``by`` added to its values."""
+        # Slopes stay as they are.
+        shift = np.outer((0.0, 1.0, 0.0), by) if self.interpolation == "cubic" else by
+        return Curve(self.times, self.values + shift, self.interpolation)
+
     def scaled(self, factor: Sequence[float] | np.ndarray) -> Curve:
         """Return the curve times ``factor``, one number a component."""
         return Curve(self.times, self.values * np.asarray(factor, float), self.interpolation)

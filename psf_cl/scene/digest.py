@@ -32,6 +32,8 @@ def scene_digest(scene: Scene) -> str:
                     digest.update(f"{item.name}=".encode())
                     add(own)
             digest.update(b")")
+        elif isinstance(value, dict):
+            add(sorted(value.items()))
         elif isinstance(value, (tuple, list)):
             digest.update(f"{len(value)}:".encode())
             for item in value:

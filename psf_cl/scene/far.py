@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from psf_cl.scene import transform
-from psf_cl.scene.model import Mesh, Scene
+from psf_cl.scene.model import Mesh, Scene, View
 
 #: A scene is far away if the origin is so many times as far from its middle as its corners are.
 #: Coordinates have 24 bits: as far out as this they still have 22 for what is in the scene.
@@ -57,9 +57,20 @@ def moved(scene: Scene, by: np.ndarray) -> Scene:
     return replace(
         scene,
         shapes=tuple(replace(s, transform=shift @ s.transform) for s in scene.shapes),
-        cameras=tuple(replace(c, transform=shift @ c.transform) for c in scene.cameras),
+        cameras=tuple(
+            replace(
+                camera,
+                transform=shift @ camera.transform,
+                view=None if camera.view is None else _moved_view(camera.view, by),
+            )
+            for camera in scene.cameras
+        ),
         lights=tuple(
             replace(light, position=tuple((np.asarray(light.position) + by).tolist()))
             for light in scene.lights
         ),
     )
+
+
+def _moved_view(view: View, by: np.ndarray) -> View:
+    return replace(view, position=view.position.moved(by), target=view.target.moved(by))

@@ -557,7 +557,8 @@ def _read_light(raw: dict[str, Any], place: Place, assembly: _Assembly) -> Light
     if "position" in tracks:
         if node >= 0:
             raise tracks["position"].place.error("expected either position or translation")
-        moved = assembly.animations.add(Node(curves={"translation": tracks["position"].curve}))
+        curves = {"translation": tracks["position"].curve}
+        moved = assembly.animations.add(Node(translation=read.position, curves=curves))
         matrix = _light_matrix(replace(read, position=(0.0, 0.0, 0.0)))
         node = assembly.animations.add(Node(moved, matrix=matrix))
     curve = tracks["intensity"].curve.scaled(color) if "intensity" in tracks else None

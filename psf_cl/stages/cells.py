@@ -82,6 +82,9 @@ def brightest(scene: Scene) -> float:
     """Return the largest radiance that anything emits; of lights without extent at 1 m."""
     emitted = [max(material.emission) for material in scene.materials]
     emitted += [max(light.intensity) for light in scene.lights]
+    curves = [material.emission_curve for material in scene.materials]
+    curves += [light.intensity_curve for light in scene.lights]
+    emitted += [float(curve.peak().max()) for curve in curves if curve is not None]
     image = scene.environment.image
     sky = np.max(scene.environment.radiance) * (1.0 if image is None else float(np.max(image)))
     largest = max([*emitted, float(sky)])

@@ -42,6 +42,7 @@ def plan(context: Context) -> StageSpec:
             "CONNECT",
             "AOV_DIRECT",
             "AOV_FEATURES",
+            "MOTION",
             "SEEN",
             *POOL_FLAGS,
             "METROPOLIS",

@@ -85,6 +85,7 @@ class StageSpec:
         traces: whether it traces rays, which takes a stack of the tree's depth.
         per_pass: whether it works on complete passes, not on the pool.
         between_passes: whether it works between epochs, which have the pool drain.
+        per_frame: whether it works before the first pass of a frame alone.
     """
 
     name: str
@@ -96,6 +97,7 @@ class StageSpec:
     traces: bool = False
     per_pass: bool = False
     between_passes: bool = False
+    per_frame: bool = False
 
     @property
     def kernel_names(self) -> tuple[str, ...]:
@@ -112,6 +114,18 @@ class Feature:
 
     value: int
     reason: str
+
+
+@dataclass(frozen=True)
+class MovingCounts:
+    """Sizes of the tables of what moves."""
+
+    triangles: int
+    vertices: int
+    influences: int
+    deltas: int
+    matrices: int
+    weights: int
 
 
 @dataclass(frozen=True)
@@ -137,6 +151,7 @@ class Context:
     texture_count: int = 0
     statistics: bool = False
     halves: bool = False
+    moving: MovingCounts | None = None
 
     @property
     def path_field_count(self) -> int:
