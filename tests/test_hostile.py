@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 import json
 import os
@@ -14,6 +15,7 @@ import PIL.Image
 import pytest
 
 from psf_cl.cli.main import main
+from psf_cl.errors import InputError
 from psf_cl.image import Image, read_exr, write_exr
 
 SCENE = '[[shapes]]\nprimitive = "quad"\n'
@@ -408,3 +410,26 @@ def test_a_sky_beyond_float32_is_limited_and_told(device, folder, capfd):
     (folder / "out.png").unlink()
     (folder / "a.toml").write_text(SCENE + '[environment]\nimage = "sky.exr"\nscale = 2\n')
     assert "environment.scale" in refused(["render", "a.toml", *arguments], capfd, folder)
+
+
+@pytest.mark.parametrize("kind", ["exr", "hdr", "png", "jpg", "checkpoint"])
+def test_damaged_images_and_checkpoints_load_soundly_or_are_refused(monkeypatch, folder, kind):
+    monkeypatch.syspath_prepend(Path(__file__).resolve().parents[1] / "tools")
+    fuzz = importlib.import_module("fuzz_readers")
+    files = fuzz.corpus(kind, [])
+    assert files
+    for whole in files:
+        fuzz.try_file(kind, whole, folder)
+    refused = 0
+    for seed in range(40):
+        data = fuzz.file_of(kind, files, seed)
+        fuzz.try_file(kind, data, folder)
+        path = folder / "a.toml" if kind in fuzz.USED_BY else folder / "a.checkpoint"
+        try:
+            if kind == "checkpoint":
+                fuzz.read_checkpoint(path, fuzz.IDENTITY, fuzz.BUFFERS)
+            else:
+                fuzz.load_scene(path)
+        except InputError:
+            refused += 1
+    assert refused > 0

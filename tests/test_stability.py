@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import itertools
+import subprocess
 import sys
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from scene_builder import build, camera, floor, glowing, inside_out, lambertian,
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.far import far_from_origin, moved
 from psf_cl.scene.model import Material
+from psf_cl.settings import PRESETS
 
 ROOT = Path(__file__).resolve().parents[1]
 VIEW = camera((0.0, 0.0, 0.95), (0.0, -0.2, -1.0), 60.0)
@@ -133,3 +135,23 @@ def test_the_table_tells_good_from_bad(tool, device, monkeypatch, tmp_path, caps
     assert "FAILED,the mean is off," in wrong and "max_depth must be from 0" in refused
     page = (tmp_path / "stability.html").read_text()
     assert page.count("<tr") == 4 and page.count("class=failed") == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lanes", [1, 16])
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_simulator_finds_no_fault_in_any_kernel(preset, lanes):
+    """Out of bounds, races, divergent barriers."""
+    command = [sys.executable, "tools/check_kernels.py", "--presets", preset, "--lanes", str(lanes)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    if "Oclgrind is not there" in done.stderr:
+        pytest.skip("Oclgrind is not installed")
+    assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", PRESETS)
+def test_the_table_of_extremes_has_no_failure(preset):
+    command = [sys.executable, "tools/stability.py", "--presets", preset, "--no-times"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout

@@ -21,15 +21,21 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from stability_cases import camera, grey, matt, room, scene_of
 
+import psf_cl.renderer
+from psf_cl.device.device import open_device
+from psf_cl.renderer import Renderer
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.model import Environment, Light, Material, Mesh, Scene, Texture
 from psf_cl.settings import PRESETS, Settings, resolve
+from psf_cl.traits import DeviceTraits
 
 LIBRARIES = (
     "/usr/lib/oclgrind/liboclgrind-rt-icd.so",
@@ -95,12 +101,22 @@ def _veil() -> Material:
 SCENES = {"room": room, "everything": everything}
 
 
+class InTurn(Executor):
+    """Does at once what it is asked to do beside."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__()
+
+    def submit(self, call: Callable[..., Any], /, *args: Any, **values: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        future.set_result(call(*args, **values))
+        return future
+
+
 def render(name: str, preset: str, lanes: int, tree: bool) -> None:
     """Render one picture on the simulator; its reports go where its environment says."""
-    from psf_cl.device.device import open_device
-    from psf_cl.renderer import Renderer
-    from psf_cl.traits import DeviceTraits
-
+    # The simulator runs one kernel at a time, whatever threads ask for it.
+    psf_cl.renderer.ThreadPoolExecutor = InTurn  # type: ignore[misc,assignment]
     few = 0 if tree else 400
     traits = DeviceTraits(
         "cpu", lanes, 16, slots=64, group=4, run=2, few_triangles=few, few_corners=few

@@ -1,4 +1,4 @@
-"""Feed the readers of scene files with damaged files: every one loads soundly or is refused.
+"""Feed readers with damaged files: scenes, images, checkpoints load soundly or are refused.
 
     python tools/fuzz_readers.py gltf --seconds 600
     python tools/fuzz_readers.py obj --seed 81234 --count 1     # once more what seed 81234 found
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import base64
+import io
 import json
 import multiprocessing
 import random
@@ -29,9 +30,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import PIL.Image
 
 from psf_cl import tables
+from psf_cl.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from psf_cl.errors import InputError
+from psf_cl.image import Image, write_exr
 from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import TEXTURE_FIELDS, Scene
 
@@ -43,6 +47,8 @@ MEMORY = 6 << 30
 
 #: Files of a corpus up to this size are used, bytes: larger ones are slow to damage.
 LARGEST = 1 << 17
+
+KINDS = ("gltf", "obj", "ply", "toml", "exr", "hdr", "png", "jpg", "checkpoint")
 
 #: What numbers are replaced by.
 NUMBERS = (
@@ -325,9 +331,60 @@ def binary_ply(mixed: bool) -> bytes:
     return head + corners + struct.pack("<B4i", 4, 0, 1, 3, 2) + more
 
 
+def pictures(kind: str) -> list[bytes]:
+    """Return small images of the ways in which the format keeps pixels."""
+    chance = np.random.default_rng(1)
+    noise = chance.integers(0, 256, (7, 9, 4), np.uint8)
+    light = chance.random((7, 9, 3), np.float32)
+    if kind == "exr":
+        more = {"rgb": light, "depth": light[..., :1]}
+        return [_exr({"rgb": light}, False), _exr(more, True)]
+    if kind == "hdr":
+        head = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=2\n\n"
+        rows = b"".join(
+            b"\2\2\0\x09" + b"\x89\x40" * 2 + b"\x09" + bytes(9) + b"\x89\x81" for _ in "ab"
+        )
+        return [head + b"-Y 7 +X 9\n" + noise.tobytes(), head + b"-Y 2 +X 9\n" + rows]
+    modes = {"png": ("RGBA", "RGB", "L", "LA", "P", "1", "I;16"), "jpg": ("RGB", "L", "CMYK")}[kind]
+    files = []
+    for mode in modes:
+        for options in ({}, {"progressive": True}) if kind == "jpg" else ({}, {"optimize": True}):
+            picture = PIL.Image.fromarray(noise)
+            picture = picture.convert("L").convert(mode) if "16" in mode else picture.convert(mode)
+            stream = io.BytesIO()
+            picture.save(stream, {"jpg": "jpeg"}.get(kind, kind), **options)
+            files.append(stream.getvalue())
+    return files
+
+
+def _exr(aovs: dict[str, np.ndarray], half: bool) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.exr"
+        write_exr(path, Image(aovs, {"spp": 4}), half)
+        return path.read_bytes()
+
+
+IDENTITY = {"scene": "a", "settings": {"max_depth": 3}}
+BUFFERS = {"film": (np.dtype("<f4"), 50), "counters": (np.dtype("<u4"), 3)}
+
+
+def a_checkpoint() -> bytes:
+    """Return a small checkpoint."""
+    arrays = {name: np.arange(count, dtype=dtype) for name, (dtype, count) in BUFFERS.items()}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a"
+        write_checkpoint(path, Checkpoint(IDENTITY, 7, (4, 8), 1.5, "a device", arrays))
+        return path.read_bytes()
+
+
 def corpus(kind: str, folders: list[Path]) -> list[bytes]:
     """Return the files to damage; an OBJ file carries its MTL after a NUL."""
-    own = {
+    own: list[bytes] = {
+        "exr": lambda: pictures(kind),
+        "hdr": lambda: pictures(kind),
+        "png": lambda: pictures(kind),
+        "jpg": lambda: pictures(kind),
+        "checkpoint": lambda: [a_checkpoint()],
         "gltf": lambda: [rich_gltf()],
         "obj": lambda: [RICH_OBJ + b"\0" + RICH_MTL],
         "ply": lambda: [RICH_PLY, binary_ply(False), binary_ply(True)],
@@ -461,6 +518,13 @@ def check_scene(scene: Scene) -> None:
         tables.material_table(scene.materials)
 
 
+#: What makes a scene that reads an image.
+TEXTURED = '[materials.m]\nbase_color_texture = "{name}"\n'
+LIT = '[environment]\nimage = "{name}"\n[materials.m]\n'
+USED_BY = {"png": TEXTURED, "jpg": TEXTURED, "exr": LIT, "hdr": LIT}
+QUAD = '[[shapes]]\nprimitive = "quad"\nmaterial = "m"\n'
+
+
 class TimeIsUp(BaseException):
     """Reading takes too long; no reader catches it."""
 
@@ -470,13 +534,19 @@ def try_file(kind: str, data: bytes, folder: Path) -> None:
     data, _, library = data.partition(b"\0") if kind == "obj" else (data, b"", b"")
     path = folder / f"a.{kind}"
     path.write_bytes(data)
+    if kind in USED_BY:
+        path = folder / "a.toml"
+        path.write_text(USED_BY[kind].format(name=f"a.{kind}") + QUAD)
     if kind == "obj":
         (folder / "a.mtl").write_bytes(library)
     signal.alarm(SECONDS)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            check_scene(load_scene(path, size=(16, 16)))
+            if kind == "checkpoint":
+                read_checkpoint(path, IDENTITY, BUFFERS)
+            else:
+                check_scene(load_scene(path, size=(16, 16)))
     except InputError as error:
         assert str(error) and "\n" not in str(error), "not one line"
     finally:
@@ -507,7 +577,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("kind", choices=("gltf", "obj", "ply", "toml"))
+    parser.add_argument("kind", choices=KINDS)
     parser.add_argument("--seed", type=int, default=0, help="the first one")
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--count", type=int, default=1 << 60, help="at most so many seeds")
