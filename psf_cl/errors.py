@@ -8,8 +8,12 @@ _SHOWN = 60
 class InputError(Exception):
     """Bad input or usage: a file, a key, a setting, an option.  Exit code 2.
 
-    The message is one line that names the file, the key and what was expected.
+    The message is one line that names the file, the key and what was expected; line breaks of names
+    in files become spaces.
     """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.splitlines()))
 
 
 class DeviceError(Exception):

@@ -235,6 +235,16 @@ def test_an_unknown_required_extension_is_refused_with_what_is_known(
     builder.load(tmp_path)
 
 
+def test_a_name_with_line_breaks_makes_no_second_line(builder: Builder, tmp_path: Path) -> None:
+    builder.node(mesh=builder.mesh())
+    path = tmp_path / "scene.gltf"
+    builder.root["buffers"] = [{"byteLength": 36, "uri": "a\nb\r.bin"}]
+    path.write_text(json.dumps(builder.root))
+    with pytest.raises(InputError, match=r"a b .bin: expected a file") as caught:
+        load_gltf(path)
+    assert len(str(caught.value).splitlines()) == 1
+
+
 # Accessors
 
 

@@ -71,6 +71,10 @@ def test_the_camera_looks_from_its_position_at_its_target(folder):
     assert camera.focus_distance == 3.0
 
 
+def test_a_camera_with_a_height_is_orthographic(folder):
+    assert load(folder, QUAD + CAMERA + "height = 2.5\n").cameras[0].height == 2.5
+
+
 def test_a_material_table_overrides_the_mesh_files_material_of_that_name_only(folder):
     text = '[materials.red]\nroughness = 0.25\n[[shapes]]\nmesh = "tri.obj"\n'
     materials = {material.name: material for material in load(folder, text).materials}
@@ -355,6 +359,8 @@ MISTAKES = [
     ("[camera]\nposition = [0, 0, nan]\ntarget = [0, 0, 0]\n", "camera.position: expected 3"),
     ("[camera]\nposition = [0, 0, 0]\ntarget = [0, 0, 0]\n", "camera: position, target and up"),
     ("[camera]\nposition = [0, 1, 0]\ntarget = [0, 0, 0]\n", "camera: position, target and up"),
+    (CAMERA + "fov_y = 40\nheight = 2\n", "camera.height: expected either height or fov_y"),
+    (CAMERA + "height = 0\n", "camera.height: expected a finite number above 0"),
     (CAMERA + "fov_y = 180\n", "camera.fov_y: expected a finite number from 0.001 to 179"),
     (CAMERA + "focus_distance = 0\n", "camera.focus_distance: expected"),
     ('[camera]\nfrom = "x"\n', "camera.from: no camera 'x' in the meshes; known: none"),

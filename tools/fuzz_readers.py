@@ -41,8 +41,9 @@ from psf_cl.scene.model import TEXTURE_FIELDS, Scene
 
 ROOT = Path(__file__).resolve().parent.parent
 
-#: Seconds and bytes that one file may take.
+#: Seconds of computing, of waiting, and bytes that one file may take.
 SECONDS = 10
+PATIENCE = 100
 MEMORY = 6 << 30
 
 #: Files of a corpus up to this size are used, bytes: larger ones are slow to damage.
@@ -99,7 +100,7 @@ def rich_gltf() -> bytes:
         "weights": np.tile(np.array([1, 0, 0, 0], "<f4"), (4, 1)),
         "times": np.array([0, 1], "<f4"),
         "turns": np.array([[0, 0, 0, 1], [0, 1, 0, 0]], "<f4"),
-        "binds": np.eye(4, dtype="<f4").reshape(1, 16),
+        "binds": np.tile(np.eye(4, dtype="<f4").reshape(1, 16), (2, 1)),
         "tangents": np.tile(np.array([1, 0, 0, 1], "<f4"), (4, 1)),
     }
     codes = {"f": 5126, "H": 5123, "B": 5121}
@@ -321,6 +322,101 @@ end_header
 """
 
 
+RICH_TOML = b"""[film]
+width = 64
+height = 48
+
+[[cameras]]
+name = "view"
+position = [0, 1, 5]
+target = [0, 0, 0]
+up = [0, 1, 0]
+fov_y = 40
+lens_radius = 0.01
+focus_distance = 5
+
+[[cameras]]
+name = "plan"
+position = [0, 5, 0.1]
+target = [0, 0, 0]
+height = 4
+
+[environment]
+radiance = [0.1, 0.1, 0.2]
+rotation = [0, 90, 0]
+
+[render]
+preset = "pt"
+max_depth = 3
+
+[materials.red]
+base_color = [1, 0.2, 0.1]
+base_color_texture = { file = "a.png", scale = [2, 2], rotation = 30, wrap = "mirror" }
+metallic = 0.5
+roughness = 0.2
+clearcoat = 1
+sheen_color = [1, 1, 1]
+emission = [1, 0, 0]
+
+[materials.glass]
+transmission = 1
+ior = 1.4
+attenuation_color = [0.5, 1, 1]
+attenuation_distance = 2
+
+[[shapes]]
+name = "a"
+primitive = "sphere"
+material = "red"
+transform = [{ scale = [1, 2, 1] }, { rotate = [10, 20, 30] }, { translate = [1, 0, 0] }]
+
+[[shapes]]
+name = "b"
+primitive = "quad"
+material = "glass"
+emission = [3, 3, 3]
+two_sided = true
+transform = [{ matrix = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]] }]
+
+[[lights]]
+type = "spot"
+name = "lamp"
+position = [0, 3, 0]
+direction = [0, -1, 0]
+intensity = 10
+color = [1, 1, 0.5]
+inner_angle = 10
+outer_angle = 20
+range = 9
+
+[[animation]]
+target = "a"
+property = "rotation"
+times = [0, 0.5, 1]
+values = [[0, 0, 0], [0, 90, 0], [0, 180, 0]]
+interpolation = "linear"
+pivot = [0, 0, 1]
+
+[[animation]]
+target = "view"
+property = "position"
+times = [0, 1]
+values = [[0, 1, 5], [1, 1, 5]]
+
+[[animation]]
+target = "red"
+property = "emission"
+times = [0, 1]
+values = [[1, 0, 0], [0, 1, 0]]
+
+[[animation]]
+target = "lamp"
+property = "intensity"
+times = [0, 1]
+values = [1, 2]
+"""
+
+
 def binary_ply(mixed: bool) -> bytes:
     """Return a binary file of a quad, and of a triangle if it is ``mixed``."""
     head = RICH_PLY.split(b"property float nx")[0].replace(b"ascii", b"binary_little_endian")
@@ -388,7 +484,10 @@ def corpus(kind: str, folders: list[Path]) -> list[bytes]:
         "gltf": lambda: [rich_gltf()],
         "obj": lambda: [RICH_OBJ + b"\0" + RICH_MTL],
         "ply": lambda: [RICH_PLY, binary_ply(False), binary_ply(True)],
-        "toml": lambda: [path.read_bytes() for path in sorted((ROOT / "scenes").glob("*.toml"))],
+        "toml": lambda: [
+            RICH_TOML,
+            *(path.read_bytes() for path in sorted((ROOT / "scenes").glob("*.toml"))),
+        ],
     }[kind]()
     suffixes = {"gltf": (".gltf", ".glb")}.get(kind, (f".{kind}",))
     for folder in folders:
@@ -539,7 +638,8 @@ def try_file(kind: str, data: bytes, folder: Path) -> None:
         path.write_text(USED_BY[kind].format(name=f"a.{kind}") + QUAD)
     if kind == "obj":
         (folder / "a.mtl").write_bytes(library)
-    signal.alarm(SECONDS)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    signal.alarm(PATIENCE)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -547,14 +647,18 @@ def try_file(kind: str, data: bytes, folder: Path) -> None:
                 read_checkpoint(path, IDENTITY, BUFFERS)
             else:
                 check_scene(load_scene(path, size=(16, 16)))
+            if kind in ("gltf", "toml"):
+                check_scene(load_scene(path, size=(16, 16), time=0.4))
+                load_scene(path, size=(16, 16), moving=True)
     except InputError as error:
         assert str(error) and "\n" not in str(error), "not one line"
     finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
         signal.alarm(0)
 
 
 def _time_is_up(number: int, frame: Any) -> None:
-    raise TimeIsUp(f"more than {SECONDS} s")
+    raise TimeIsUp
 
 
 def file_of(kind: str, files: list[bytes], seed: int) -> bytes:
@@ -566,7 +670,8 @@ def file_of(kind: str, files: list[bytes], seed: int) -> bytes:
 def work(kind: str, files: list[bytes], folder: Path, now: Any, end: Callable[[int], bool]) -> None:
     """Try seeds from ``now`` on, in a process of its own, which the first fault ends."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    signal.signal(signal.SIGALRM, _time_is_up)
+    for number in (signal.SIGALRM, signal.SIGPROF):
+        signal.signal(number, _time_is_up)
     while not end(now.value):
         try_file(kind, file_of(kind, files, now.value), folder)
         now.value += 1

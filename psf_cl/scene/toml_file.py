@@ -89,6 +89,7 @@ CAMERA: Schema = {
     "target": Key(_POINT, "the point looked at, meters"),
     "up": Key(_DIRECTION, "a direction"),
     "fov_y": Key(number(0.001, 179), "vertical field of view, degrees"),
+    "height": Key(number(above=0, high=MAX_LENGTH), "meters from bottom to top, for parallel rays"),
     "lens_radius": Key(number(0, MAX_LENGTH), "meters; 0 is a pinhole"),
     "focus_distance": Key(number(above=0, high=MAX_LENGTH), "meters"),
 }
@@ -621,7 +622,9 @@ def _read_camera(raw: dict[str, Any], place: Place, assembly: _Assembly) -> Came
     values = read_table(raw, CAMERA, place)
     # The one camera of a scene may do without a name.
     tracks = assembly.animations.of("camera", values.get("name", "camera"))
-    kept = ("name", "lens_radius", "focus_distance")
+    kept = ("name", "height", "lens_radius", "focus_distance")
+    if "height" in values and "fov_y" in values:
+        raise place.key("height").error("expected either height or fov_y")
     changes = {key: values[key] for key in kept if key in values}
     if "fov_y" in values:
         changes["fov_y"] = math.radians(values["fov_y"])
