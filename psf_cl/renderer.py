@@ -49,7 +49,7 @@ LOOKS_PER_CENSUS = 8
 LESS_ROOM = 0.7
 
 #: Cost of the tree, relative to when it was built, from which on another one is built.
-REBUILD_RATIO = 1.25
+REBUILD_RATIO = 1.15
 
 #: Passes before the error is estimated for the first time, and the ratio from then on.
 FIRST_ESTIMATE = 16

@@ -18,6 +18,7 @@ from psf_cl.renderer import Renderer
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.animation import baked, posed, shaped
 from psf_cl.scene.curve import Curve, smooth_curve
+from psf_cl.scene.digest import scene_digest
 from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Mesh, Morphs, Node, Skin
 from psf_cl.settings import Settings
@@ -402,6 +403,15 @@ def test_a_camera_that_looks_at_itself_is_told_with_the_time(tmp_path):
     scene = load_scene(path, moving=True)
     with pytest.raises(InputError, match="camera '' at 1 s"):
         posed(scene, 1.0)
+
+
+@pytest.mark.parametrize("path", sorted(Path(__file__).parents[1].glob("scenes/moving/*.toml")))
+def test_example_scenes_move_and_say_what_for(path):
+    assert path.read_text().startswith("# ")
+    scene = load_scene(path, moving=True)
+    assert scene.notes == ()
+    early, late = (load_scene(path, time=time) for time in (0.0, 0.6))
+    assert scene_digest(early) != scene_digest(late)
 
 
 # Files

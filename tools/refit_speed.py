@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from psf_cl import renderer as renderer_module
-from psf_cl.cli.common import positive_integer
+from psf_cl.cli.common import positive_integer, positive_number
 from psf_cl.device.bvh import build_bvh
 from psf_cl.device.device import Device, open_device
 from psf_cl.renderer import Renderer
@@ -30,9 +30,6 @@ from psf_cl.scene.model import Environment, Material, Mesh, Node, Scene, Shape, 
 from psf_cl.settings import Settings
 
 JOINTS = 16
-
-#: Turn of the upper end against the lower one, degrees a frame.
-TWIST = 10.0
 
 
 def ball(rows: int) -> Mesh:
@@ -59,9 +56,9 @@ def ball(rows: int) -> Mesh:
     )
 
 
-def twisting(rows: int, size: int) -> Scene:
-    """Return a scene of the ball; a second is a frame."""
-    times, last = np.array([0.0, 1000.0]), 1000.0 * TWIST
+def twisting(rows: int, size: int, twist: float) -> Scene:
+    """Return a scene of the ball, turned by ``twist`` degrees from end to end in a second."""
+    times, last = np.array([0.0, 1000.0]), 1000.0 * twist
     turns = [np.array([[0, 0, 0], [0, last * joint / (JOINTS - 1), 0]]) for joint in range(JOINTS)]
     nodes = tuple(Node(curves={"rotation": Curve(times, turn)}) for turn in turns)
     skin = Skin(tuple(range(JOINTS)), np.tile(np.eye(4), (JOINTS, 1, 1)))
@@ -105,15 +102,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--rows", type=positive_integer, default=354, help="of quads (354)")
-    parser.add_argument("--size", type=positive_integer, default=192, help="film, pixels (192)")
-    parser.add_argument("--rounds", type=positive_integer, default=5, help="of timing (5)")
-    parser.add_argument("--spp", type=positive_integer, default=2, help="of a round (2)")
+    parser.add_argument("--size", type=positive_integer, default=128, help="film, pixels (128)")
+    parser.add_argument("--rounds", type=positive_integer, default=3, help="of timing (3)")
+    parser.add_argument("--spp", type=positive_integer, default=64, help="of a round (64)")
+    parser.add_argument("--twist", type=positive_number, default=20.0, help="degrees a frame (20)")
     parser.add_argument("--frames", type=positive_integer, default=99, help="at most (99)")
     args = parser.parse_args(arguments)
     due = renderer_module.REBUILD_RATIO
     # This loop decides when to end.
     renderer_module.REBUILD_RATIO = float("inf")
-    scene = twisting(args.rows, args.size)
+    scene = twisting(args.rows, args.size, args.twist)
     device = open_device(profiling=True)
     opened = Renderer(scene, Settings(), device, statistics=True)
     assert opened.refit is not None and opened.mover is not None
