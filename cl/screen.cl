@@ -30,6 +30,8 @@ kernel void resolve_light(
     const float count = (float)max(film[pixel].count, 1u);
     light[pixel].count = (float)film[pixel].count;
     light[pixel].alpha = 1.0f;
+    light[pixel].square = 0.0f;
+    light[pixel].change = 0.0f;
     for (uint c = 0; c < 3; ++c) {
         light[pixel].rgb[c] = (film[pixel].sum[c] - film[pixel].lost[c]) / count;
         light[pixel].base[c] = (film_base[pixel].sum[c] - film_base[pixel].lost[c]) / count;

@@ -322,7 +322,14 @@ kernel void shade_paths(
 
     const Mask goes_on = hit & (depth < params->max_depth);
 #if SEEN
+#if INSTANCES
+    const UInt shape = 1u + ((s.instance * 0x9e3779b1u + GATHER_U(surfaces, s.triangle, shape)) >> 2);
+#elif MOTION
+    const UInt shape = (1u + GATHER_U(surfaces, triangle, shape))
+                       | pick_u(triangle >= params->first_moving, (UInt)(SHAPE_MOVES), (UInt)(0u));
+#else
     const UInt shape = 1u + GATHER_U(surfaces, triangle, shape);
+#endif
 #if SEEN == 2 && MOTION
     const Vec3 before = previous_point(params, previous, triangle, u, v, s.p);
 #else

@@ -7,13 +7,22 @@
 #include "common/lanes.h"
 #include "common/layout.h"
 #include "common/pixels.h"
+#include "common/probes.h"
 #include "common/view.h"
 
 // Normals whose cosine is below are those of different surfaces.
 #define LEAST_COSINE 0.9f
 
-// What is left of a history of which a part has changed: (1 - change)^FORGETTING of its samples.
-#define FORGETTING 8.0f
+#if TEMPORAL == 2
+/// How much the light has changed of what was seen in a column and a row of the frame before: 0 to 1.
+static inline Float change_at(__global const Params *params, __global const float *changes, Float column, Float row)
+{
+    const Float x = clamp(column, (Float)(0.0f), (Float)((float)params->crop_width - 1.0f));
+    const Float y = clamp(row, (Float)(0.0f), (Float)((float)params->crop_height - 1.0f));
+    const UInt at = to_uint(y * (1.0f / PROBE_TILE)) * probe_columns(params) + to_uint(x * (1.0f / PROBE_TILE));
+    return gather_words(changes, at);
+}
+#endif
 
 // Pixels that are missed by less are hit.
 #define LEAST_SHIFT 1e-3f
@@ -40,7 +49,35 @@ typedef struct {
     Vec3 rgb;
     Vec3 base;
     Float count;
+    Float square;
 } Known;
+
+// A change from which on nothing is kept.
+#define CERTAIN 0.5f
+
+// A bias counts as one so many times as large: pixels have it together, and it stays.
+#define BIAS_FACTOR 2.0f
+
+// Before frames have shown it, their standard deviation is taken for half of the light, as two frames would say.
+#define PRIOR_VARIANCE 0.25f
+#define PRIOR_FRAMES 2.0f
+
+static inline Float luminance_of(Vec3 c) { return 0.2126f * c.x + 0.7152f * c.y + 0.0722f * c.z; }
+
+/// Samples that a history is worth of which a part has changed: with N of variance v and a bias b, it errs as
+/// N / (1 + N b^2 / v) without bias.  All of them if nothing has changed.
+static inline Float worth_of(Known known, Float change, Float fresh)
+{
+    const Float level = luminance_of(known.rgb);
+    // A change of c of the brighter of both leaves at least 1 - c of it.
+    const Float bias = BIAS_FACTOR * change * level / (1.0f - min(change, CERTAIN));
+    const Float frames = known.count / max(fresh, 1.0f);
+    const Float spread = max(known.square - level * level, 0.0f);
+    const Float variance =
+        (frames * spread + PRIOR_FRAMES * PRIOR_VARIANCE * level * level) / (frames + PRIOR_FRAMES);
+    const Float ratio = frames * bias * bias / max(variance, 1e-30f);
+    return pick(change > 0.0f, known.count / (1.0f + ratio), known.count);
+}
 
 /// What a pixel sees, as the tests of its history need it.
 typedef struct {
@@ -87,6 +124,7 @@ static inline void add_history(
     known->rgb = add_scaled(known->rgb, rgb, part);
     known->base = add_scaled(known->base, base, part);
     known->count += count * part;
+    known->square += GATHER(history, at, square) * part;
     *weights += part;
 }
 
@@ -96,7 +134,7 @@ static inline void add_history(
 /// shape, normals that agree, each within a pixel's footprint of the plane of the other.  One that moved by
 /// whole pixels, or not at all, takes one of them as it is.
 ///
-/// reads   film, film_base, surfaces_seen, motion, history
+/// reads   film, film_base, surfaces_seen, motion, history, changes
 /// writes  light
 kernel void blend_history(
     __global const Params *params,
@@ -107,6 +145,9 @@ kernel void blend_history(
     __global const SeenMean *surfaces_seen,
     __global const float *motion,
     __global const History *history,
+#if TEMPORAL == 2
+    __global const float *changes,
+#endif
     __global PixelLight *light)
 {
     const uint first = get_global_id(0) * W;
@@ -127,7 +168,9 @@ kernel void blend_history(
     known.rgb = zero;
     known.base = zero;
     known.count = (Float)(0.0f);
+    known.square = (Float)(0.0f);
     Float weights = (Float)(0.0f);
+    Float change = (Float)(0.0f);
     if ((params->history_flags & HISTORY_THERE) && params->temporal_rule != RULE_OFF) {
         UInt x;
         UInt y;
@@ -150,6 +193,10 @@ kernel void blend_history(
         const Mask none = !MASK_ALL;
         const Mask still = params->history_flags & HISTORY_STILL ? MASK_ALL : none;
         const Mask same_view = params->history_flags & HISTORY_SAME_VIEW ? MASK_ALL : none;
+#if TEMPORAL == 2
+        if (params->temporal_rule == RULE_ADAPTIVE)
+            change = change_at(params, changes, left, top);
+#endif
         const Mask unmoved = same_view & (right == 0.0f) & (down == 0.0f);
         for (uint k = 0; k < 4; ++k) {
             const Float share = ((k & 1u) ? aside : 1.0f - aside) * ((k & 2u) ? below : 1.0f - below);
@@ -160,29 +207,41 @@ kernel void blend_history(
         known.rgb = scale(known.rgb, whole);
         known.base = scale(known.base, whole);
         known.count = known.count * whole;
+        known.square = known.square * whole;
     }
 
     const Mask is_known = known.count > 0.0f;
-    const Float kept = pick(is_known, known.count, (Float)(0.0f));
+    const Float kept = pick(is_known, worth_of(known, change, fresh), (Float)(0.0f));
     Float alpha = fresh / max(kept + fresh, 1.0f);
     Float count = kept + fresh;
     if (params->temporal_rule == RULE_EXPONENTIAL) {
         alpha = pick(is_known, (Float)(params->temporal_alpha), (Float)(1.0f));
         count = min(count, fresh / max(alpha, 1e-6f));
     }
+    const Mask changed = is_known & (change > 0.0f);
+    const Float part = min(change * (1.0f / CERTAIN), 1.0f);
+    alpha = pick(changed, alpha + part * part * (1.0f - alpha), alpha);
+    // As many samples as would have this weight if nothing had changed.
+    count = pick(changed, fresh / max(alpha, 1e-6f), count);
     alpha = pick(is_known, alpha, (Float)(1.0f));
     const Vec3 mean = add_scaled(scale(known.rgb, 1.0f - alpha), rgb, alpha);
+    const Float brightness = luminance_of(rgb);
+    const Float square = (1.0f - alpha) * known.square + alpha * brightness * brightness;
     const Vec3 base_mean = add_scaled(scale(known.base, 1.0f - alpha), base, alpha);
 
-    const Float values[8] = {mean.x, mean.y, mean.z, count, base_mean.x, base_mean.y, base_mean.z, alpha};
-    float lane[8][W];
-    for (uint c = 0; c < 8; ++c)
+    const Float values[10] = {mean.x,      mean.y,      mean.z, count,  base_mean.x,
+                              base_mean.y, base_mean.z, alpha,  square, change};
+    float lane[10][W];
+    for (uint c = 0; c < 10; ++c)
         store_lanes(values[c], lane[c]);
     const uint lanes = min(params->pixel_count - first, (uint)W);
-    for (uint k = 0; k < lanes; ++k)
+    for (uint k = 0; k < lanes; ++k) {
+        __global float *words = (__global float *)(light + first + k);
         vstore8((float8)(lane[0][k], lane[1][k], lane[2][k], lane[3][k], lane[4][k], lane[5][k], lane[6][k],
                          lane[7][k]),
-                first + k, (__global float *)light);
+                0, words);
+        vstore4((float4)(lane[8][k], lane[9][k], 0.0f, 0.0f), 2, words);
+    }
 }
 
 /// Keep the light of this frame, and what it sees, for the next.  One work item a pixel, after
@@ -203,6 +262,7 @@ kernel void keep_history(
     __global History *to = &history[pixel];
     to->count = light[pixel].count;
     to->shape = seen->shape;
+    to->square = light[pixel].square;
     const float3 ns = vload3(0, seen->ns);
     const float length2 = dot(ns, ns);
     vstore3(vload3(0, light[pixel].rgb), 0, to->rgb);

@@ -36,6 +36,7 @@ from psf_cl.stages import (
     guide,
     intersect,
     metropolis,
+    probes,
     screen,
     seen,
     shade,
@@ -256,6 +257,7 @@ def make_plan(
     features = _features(scene, settings, outputs)
     features["FEW"] = _few(shown, corners, traits)
     features["INSTANCES"] = _instances(levels, shown)
+    features["TEMPORAL"] = _temporal(settings, features)
     if full:
         features = _all_on(features)
     pixel_count = width * height
@@ -265,6 +267,7 @@ def make_plan(
         traits,
         pixel_count,
         _ring(pixel_count, traits, features, RING_BYTES >> halvings),
+        crop_size=(width, height),
         statistics=statistics,
         halves=halves,
         max_depth=settings.max_depth,
@@ -291,6 +294,7 @@ def make_plan(
         splats,
         seen,
         film,
+        probes,
         temporal,
         screen,
         guide,
@@ -517,9 +521,6 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
         "CELLS": _cells(settings, glossy),
         "SEEN": _seen(settings, outputs),
         "BASE": _base(settings, glossy),
-        "TEMPORAL": switch(
-            settings.temporal != "off", f"temporal is {settings.temporal}", "temporal is off"
-        ),
         "METROPOLIS": switch(
             settings.integrator == "metropolis",
             "integrator is metropolis",
@@ -555,6 +556,17 @@ def _cells(settings: Settings, glossy: bool) -> Feature:
     return Feature(1, "path_filter is hash_grid; every material is matt")
 
 
+def _temporal(settings: Settings, features: dict[str, Feature]) -> Feature:
+    """Return whether frames share light: 2 if they also look for where it changes."""
+    if settings.temporal == "off":
+        return Feature(0, "temporal is off")
+    if settings.temporal != "adaptive":
+        return Feature(1, f"temporal is {settings.temporal}")
+    if not features["CONNECT"].value:
+        return Feature(1, "temporal is adaptive, but no light is sampled whose changes probes see")
+    return Feature(2, "temporal is adaptive: probes look for changes of light")
+
+
 def _seen(settings: Settings, outputs: frozenset[str]) -> Feature:
     """Return whether the first surfaces are kept: 2 with where they were in the frame before."""
     if settings.temporal != "off":
@@ -580,7 +592,7 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
 
     What is on keeps its value: as an image of one texel a constant sky would be sampled otherwise.
     """
-    most = {"ALPHA": 2, "ENVIRONMENT": 2, "CELLS": 2, "BASE": 2, "SEEN": 2}
+    most = {"ALPHA": 2, "ENVIRONMENT": 2, "CELLS": 2, "BASE": 2, "SEEN": 2, "TEMPORAL": 2}
     full = {
         name: feature
         if feature.value

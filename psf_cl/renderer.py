@@ -39,7 +39,7 @@ from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Scene
 from psf_cl.scheduler import Hooks, Progress, Scheduler, doubling_epoch
 from psf_cl.settings import Settings, resolve
-from psf_cl.stages import cells, film, guide, metropolis, screen, temporal
+from psf_cl.stages import cells, film, guide, metropolis, probes, screen, temporal
 
 #: Looks of the host at the counters for each count of the paths by depth, which takes 0.4 ms on two
 #: CPU cores; the first look, which is left out, is at a pool that is still empty.
@@ -264,6 +264,8 @@ class Renderer:
                 self._change_lights()
             values["history_flags"] = self._history_flags(before, values) if whole else 0
             self._set_params(values | {"first_pass": first})
+            for launch, items in self.change_launches if whole else ():
+                launch(items)
             self.device.wait()
         finally:
             self.scheduler.clock.stop()
@@ -274,6 +276,8 @@ class Renderer:
             # Not what the screen filter makes of it: light would spread from frame to frame.
             for launch, items in (*self.blend_launches, *self.history_launches):
                 launch(items, film.GROUP)
+            for launch, items in self.probe_launches:
+                launch(items)
 
     def _history_flags(self, before: np.ndarray, values: Mapping[str, Any]) -> int:
         """Return what ``Params.history_flags`` say of the frame that begins."""
@@ -471,7 +475,7 @@ class Renderer:
             return image.reshape(height, width, 1)
 
         aovs["samples"] = scalar(main["count"])
-        if names & {"motion", "history", "alpha"}:
+        if names & {"motion", "history", "alpha", "gradient"}:
             aovs |= self._temporal_aovs(main["count"], bool(partial))
         count = main["count"].astype(np.float64)
         variance = main["squares"] / np.maximum(count - 1, 1) / np.maximum(count, 1)
@@ -503,10 +507,12 @@ class Renderer:
 
     def _temporal_aovs(self, count: np.ndarray, partial: bool) -> dict[str, np.ndarray]:
         """Return what frames say of one another; ``count`` are the samples of this one."""
-        aovs = {"history": count, "alpha": np.ones_like(count)}
+        nothing = np.zeros(len(count), np.float32)
+        aovs = {"history": count, "alpha": nothing + 1.0, "gradient": nothing}
         if self.plan.features["TEMPORAL"].value and not partial:
             light = self.device.read(self.buffers["light"])
-            aovs = {"history": light["count"], "alpha": light["alpha"]}
+            names = {"history": "count", "alpha": "alpha", "gradient": "change"}
+            aovs = {name: light[field] for name, field in names.items()}
         if "motion" in self.buffers:
             for launch, items in self.motion_launches:
                 launch(items, film.GROUP)
@@ -963,12 +969,11 @@ class Renderer:
     def _bind_pictures(self, programs: dict[str, Program]) -> None:
         """Bind what makes the picture of sums and history, and the history of the picture."""
 
-        def launches(*names: str) -> list[tuple[Launch, int]]:
-            traits, pixels = self.plan.traits, self.plan.pixel_count
+        def launches(*names: str, count: int = self.plan.pixel_count) -> list[tuple[Launch, int]]:
             return [
                 (
                     programs[stage.name].bind_planned(name, self.buffers),
-                    -(-pixels // kernel.paths_per_item(traits)),
+                    -(-count // kernel.paths_per_item(self.plan.traits)),
                 )
                 for name in names
                 for stage in self.plan.stages
@@ -979,6 +984,10 @@ class Renderer:
         shared = bool(self.plan.features["TEMPORAL"].value)
         self.motion_launches = launches("find_motion")
         self.history_launches = launches("keep_history")
+        count = probes.count(*self.plan.crop[2:])
+        # Before the scene moves, and after it.
+        self.probe_launches = launches("place_probes", "measure_probes", count=count)
+        self.change_launches = launches("measure_probes", "pool_probes", count=count)
         self.blend_launches = (
             launches("find_motion", "blend_history") if shared else launches("resolve_light")
         )

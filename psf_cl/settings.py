@@ -29,6 +29,7 @@ AOVS = {
     "motion": "pixels that what is seen has moved since the frame before: right, down",
     "history": "samples that the pixel is worth, with those of the frames before",
     "alpha": "weight of this frame in it",
+    "gradient": "change of the light since the frame before, 0 to 1, as probes found it",
 }
 
 

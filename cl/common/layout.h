@@ -51,6 +51,7 @@
 #define RULE_EXPONENTIAL 1u // a frame has a constant weight
 #define RULE_CUMULATIVE 2u // all samples since it was first seen have the same weight
 #define RULE_ADAPTIVE 3u // the same where nothing changes, more for new ones where something does
+#define PROBE_TILE 4u // edge of the tiles that have a probe each, pixels
 #define HISTORY_THERE 1u // there is a frame before
 #define HISTORY_STILL 2u // neither camera nor geometry has moved since
 #define HISTORY_SAME_VIEW 4u // the camera has not moved since
@@ -522,6 +523,9 @@ typedef struct {
     float count; // samples that it is worth
     float base[3]; // of that, what the diffuse base of the first surface reflected
     float alpha; // weight that this frame has in it
+    float square; // mean of the squared luminance of frames
+    float change; // of the light since the frame before, 0 to 1
+    float pad[2]; // fills the record
 } PixelLight;
 
 /// A pixel of the frame before: its light and what it sees.
@@ -531,10 +535,27 @@ typedef struct {
     float base[3]; // of that, what the diffuse base of the first surface reflected
     uint shape; // as SeenMean.shape
     float p[3]; // world, m
-    float pad0; // fills the word
+    float square; // mean of the squared luminance of frames
     float ns[3]; // unit, shading normal
-    float pad1; // fills the record
+    float pad; // fills the record
 } History;
+
+/// A path from a surface that is traced again in the next frame.
+typedef struct {
+    uint triangle; // of its vertex; NO_HIT if there is none
+    float u; // barycentric coordinate there
+    float v; // barycentric coordinate there
+    uint seed; // of the points on its lights
+    float direction[3]; // unit, in which it goes on
+    uint light; // of its vertex
+    float wo[3]; // unit, from where it was seen
+    uint next_light; // of the surface that it goes on to
+    float pmf; // chance that the light had
+    float next_pmf; // the same of the next
+    float reflected[2]; // luminance that its surfaces reflected in the frame before, and in this one
+    float emitted[2]; // luminance that its vertex gave away itself, in both
+    float pad[2]; // fills the record
+} Probe;
 
 /// The vertex of a sample behind which light is shared.
 typedef struct {

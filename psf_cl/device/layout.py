@@ -457,6 +457,9 @@ PIXEL_LIGHT = Record(
     float count - samples that it is worth
     float base[3] - of that, what the diffuse base of the first surface reflected
     float alpha - weight that this frame has in it
+    float square - mean of the squared luminance of frames
+    float change - of the light since the frame before, 0 to 1
+    float pad[2] - fills the record
     """),
 )
 
@@ -469,9 +472,29 @@ HISTORY = Record(
     float base[3] - of that, what the diffuse base of the first surface reflected
     uint shape - as SeenMean.shape
     float p[3] - world, m
-    float pad0 - fills the word
+    float square - mean of the squared luminance of frames
     float ns[3] - unit, shading normal
-    float pad1 - fills the record
+    float pad - fills the record
+    """),
+)
+
+PROBE = Record(
+    "Probe",
+    "A path from a surface that is traced again in the next frame.",
+    _fields("""
+    uint triangle - of its vertex; NO_HIT if there is none
+    float u - barycentric coordinate there
+    float v - barycentric coordinate there
+    uint seed - of the points on its lights
+    float direction[3] - unit, in which it goes on
+    uint light - of its vertex
+    float wo[3] - unit, from where it was seen
+    uint next_light - of the surface that it goes on to
+    float pmf - chance that the light had
+    float next_pmf - the same of the next
+    float reflected[2] - luminance that its surfaces reflected in the frame before, and in this one
+    float emitted[2] - luminance that its vertex gave away itself, in both
+    float pad[2] - fills the record
     """),
 )
 
@@ -567,6 +590,7 @@ RECORDS = (
     SEEN_MEAN,
     PIXEL_LIGHT,
     HISTORY,
+    PROBE,
     CELL_VERTEX,
     BEYOND,
     CELL,
@@ -784,6 +808,7 @@ CONSTANTS = (
     ("RULE_EXPONENTIAL", 1, "a frame has a constant weight"),
     ("RULE_CUMULATIVE", 2, "all samples since it was first seen have the same weight"),
     ("RULE_ADAPTIVE", 3, "the same where nothing changes, more for new ones where something does"),
+    ("PROBE_TILE", 4, "edge of the tiles that have a probe each, pixels"),
     ("HISTORY_THERE", 1, "there is a frame before"),
     ("HISTORY_STILL", 2, "neither camera nor geometry has moved since"),
     ("HISTORY_SAME_VIEW", 4, "the camera has not moved since"),

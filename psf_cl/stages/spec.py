@@ -135,12 +135,14 @@ class Context:
     Attributes:
         pixel_count: pixels that are rendered.
         ring: passes that may be in flight, a power of two.
+        crop_size: width and height of what is rendered, pixels.
     """
 
     features: dict[str, Feature]
     traits: DeviceTraits
     pixel_count: int
     ring: int
+    crop_size: tuple[int, int] = (0, 0)
     max_depth: int = 0
     texel_count: int = 1
     environment_count: int = 0

@@ -1,0 +1,266 @@
+// Probes: a small share of the paths of a frame, traced again in the next one, to find where light changes.
+//
+// A probe is a path, not the random numbers that led to it, for what is learned or emitted between frames
+// changes what numbers lead to.  It stores its vertex on a triangle, the direction that goes on from there,
+// and for both surfaces a light and the seed of the point on it, and it is compared with itself: traced in
+// the frame that it was made in, and as what is there now moves and shines.
+//
+// After Schied, Peters, Dachsbacher: Gradient Estimation for Real-Time Adaptive Temporal Filtering, 2018.
+
+#include "common/features.h"
+#include "common/lanes.h"
+#include "common/layout.h"
+#include "common/pixels.h"
+#include "common/probes.h"
+#include "common/rng.h"
+#include "common/camera_ray.h"
+#include "common/surface.h"
+#include "common/trace.h"
+#include "common/light.h"
+
+// What both kernels that trace need of the scene.
+#if SMOOTH
+#define NORMAL_PARAMETERS , __global const Normals *normals
+#define NORMAL_ARGUMENTS , normals
+#else
+#define NORMAL_PARAMETERS
+#define NORMAL_ARGUMENTS
+#endif
+#if ENVIRONMENT == 2
+#define SKY_PARAMETERS , __global const EnvironmentCell *environment
+#define SKY_ARGUMENTS environment,
+#define LAST_SKY , environment
+#else
+#define SKY_PARAMETERS
+#define SKY_ARGUMENTS
+#define LAST_SKY
+#endif
+#if ALPHA == 2
+#define SEEDS_PARAMETER , const uint *ray_seeds
+#define SEEDS_ARGUMENT , ray_seeds
+#define DEFINE_PROBE_SEEDS(seed)                                                                   \
+    uint ray_seeds[W];                                                                             \
+    store_lanes_u(seed, ray_seeds)
+#else
+#define SEEDS_PARAMETER
+#define SEEDS_ARGUMENT
+#define DEFINE_PROBE_SEEDS(seed)
+#endif
+#define SCENE_PARAMETERS                                                                           \
+    __global const Params *params, TRIANGLE_BUFFERS, __global const Surface *surfaces NORMAL_PARAMETERS, \
+        __global const Material *materials TEXTURE_PARAMETERS COLOR_PARAMETERS,                    \
+        __global const Light *lights SKY_PARAMETERS
+
+static inline Float luminance_of(Vec3 c) { return 0.2126f * c.x + 0.7152f * c.y + 0.0722f * c.z; }
+
+/// Light of the chosen light that a white surface at `s` reflects, as luminance; 0 outside of `mask`.
+LARGE_FUNCTION Float reflected_light(
+    SCENE_PARAMETERS SEEDS_PARAMETER, Mask mask, SurfacePoint s, LightChoice choice, UInt seed)
+{
+    const Vec3 above = add_scaled(s.p, s.ng, s.offset);
+    const LightSample light = sample_light(params, lights, surfaces, materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS,
+                                           SKY_ARGUMENTS mask, above, seed, (UInt)(0u), (UInt)(0u), choice);
+    const Float cosine = dot3(s.ns, light.wi);
+    const Mask lit = mask & (light.pdf > 0.0f) & (cosine > 0.0f) & (dot3(s.ng, light.wi) > 0.0f);
+    if (!any_lane(lit))
+        return (Float)(0.0f);
+    const Mask blocked = blocked_rays(params, lit, above, light.toward, GEOMETRY_ARGUMENTS);
+    const Float arrives = luminance_of(light.radiance) * cosine * INV_PI / pick(lit, light.pdf, (Float)(1.0f));
+    return pick(lit & !blocked, arrives, (Float)(0.0f));
+}
+
+/// Trace every probe as the scene is now; what it brought before comes to the first place.  One work item W probes.
+///
+/// It brings what reaches its vertex from its light, and what reaches the surface that its direction leads
+/// to; both are taken for matt, and the first for white.
+///
+/// reads   probes
+/// writes  probes.{reflected, emitted}
+kernel void measure_probes(SCENE_PARAMETERS, __global Probe *probes)
+{
+    const uint first = get_global_id(0) * W;
+    const uint count = probe_columns(params) * probe_rows(params);
+    if (first >= count)
+        return;
+    const UInt at = min(lanes_before(MASK_ALL) + first, (UInt)(count - 1u));
+    const UInt triangle = GATHER_U(probes, at, triangle);
+    const Mask there = triangle != NO_HIT;
+    const UInt seed = GATHER_U(probes, at, seed);
+    DEFINE_PROBE_SEEDS(seed);
+    const Vec3 wo = vec3(GATHER(probes, at, wo[0]), GATHER(probes, at, wo[1]), GATHER(probes, at, wo[2]));
+    const SurfacePoint s = surface_point(pick_u(there, triangle, (UInt)(0u)), GATHER(probes, at, u),
+                                         GATHER(probes, at, v), wo, surfaces NORMAL_ARGUMENTS INSTANCE_ARGUMENTS);
+    LightChoice choice;
+    choice.light = GATHER_U(probes, at, light);
+    choice.pmf = GATHER(probes, at, pmf);
+    Float value = reflected_light(params, TRIANGLE_ARGUMENTS, surfaces NORMAL_ARGUMENTS,
+                                  materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS, lights LAST_SKY SEEDS_ARGUMENT,
+                                  there, s, choice, seed);
+    const Mask shines = there & (s.front | ((GATHER_U(materials, s.material, flags) & MATERIAL_TWO_SIDED_EMISSION) != 0u));
+    const Vec3 emission = vec3(GATHER(materials, s.material, emission[0]), GATHER(materials, s.material, emission[1]),
+                               GATHER(materials, s.material, emission[2]));
+    const Float emitted = pick(shines, luminance_of(emission), (Float)(0.0f));
+
+    const Vec3 direction = vec3(GATHER(probes, at, direction[0]), GATHER(probes, at, direction[1]),
+                                GATHER(probes, at, direction[2]));
+    const Hits hits = closest_hits(params, there, ray_origin(s, direction), direction, GEOMETRY_ARGUMENTS);
+    const Mask hit = there & (hits.triangle != NO_HIT);
+    const SurfacePoint beyond = surface_point(pick_u(hit, hits.triangle, (UInt)(0u)), hits.u, hits.v,
+                                              scale(direction, (Float)(-1.0f)), surfaces NORMAL_ARGUMENTS INSTANCE_ARGUMENTS);
+    choice.light = GATHER_U(probes, at, next_light);
+    choice.pmf = GATHER(probes, at, next_pmf);
+    const Vec3 color = vec3(GATHER(materials, beyond.material, base_color[0]),
+                            GATHER(materials, beyond.material, base_color[1]),
+                            GATHER(materials, beyond.material, base_color[2]));
+    value += luminance_of(color)
+             * reflected_light(params, TRIANGLE_ARGUMENTS, surfaces NORMAL_ARGUMENTS,
+                               materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS, lights LAST_SKY SEEDS_ARGUMENT,
+                               hit, beyond, choice, mix_bits(seed + 1u));
+
+    float lane[2][W];
+    store_lanes(value, lane[0]);
+    store_lanes(emitted, lane[1]);
+    const uint lanes = min(count - first, (uint)W);
+    for (uint k = 0; k < lanes; ++k) {
+        __global Probe *probe = &probes[first + k];
+        const float4 both = (float4)(probe->reflected[1], lane[0][k], probe->emitted[1], lane[1][k]);
+        vstore4(both, 0, probe->reflected);
+    }
+}
+
+/// A light for a surface: where `usual` as paths choose theirs, else any, for one that is off may be on in the
+/// next frame.
+static inline LightChoice light_for_probe(
+    __global const Params *params,
+    __global const Light *lights CHOICE_PARAMETERS,
+    Mask mask,
+    SurfacePoint s,
+    UInt random,
+    Mask usual)
+{
+    const Vec3 above = add_scaled(s.p, s.ng, s.offset);
+    LightChoice choice = choose_light(params, lights CHOICE_ARGUMENTS, mask, above, s.ng, random);
+    const UInt any = mul_hi(random, (UInt)(params->light_count));
+    choice.light = pick_u(usual, choice.light, any);
+    const Float chance = light_chance(params, lights CHOICE_ARGUMENTS, mask, choice.light, above, s.ng);
+    choice.pmf = 0.5f * chance + 0.5f / (float)params->light_count;
+    return choice;
+}
+
+/// Start a probe in each tile of the film.  One work item W probes.
+///
+/// reads   nothing of the frames before
+/// writes  probes
+kernel void place_probes(SCENE_PARAMETERS CHOICE_PARAMETERS, __global Probe *probes)
+{
+    const uint first = get_global_id(0) * W;
+    const uint columns = probe_columns(params);
+    const uint count = columns * probe_rows(params);
+    if (first >= count)
+        return;
+    const UInt at = min(lanes_before(MASK_ALL) + first, (UInt)(count - 1u));
+    const UInt row = divide(at, columns);
+    const UInt column = at - row * columns;
+    const UInt seed = mix_bits(at + mix_bits((UInt)(params->seed + params->first_pass * 0x9e3779b9u)));
+    DEFINE_PROBE_SEEDS(seed);
+    UInt random[4];
+    for (uint k = 0; k < 4; ++k)
+        random[k] = mix_bits(seed + (k + 2u) * 0x9e3779b9u);
+    const Float x = min((to_float(column) + unit_float(random[0])) * (float)PROBE_TILE, (float)params->crop_width - 0.01f);
+    const Float y = min((to_float(row) + unit_float(random[1])) * (float)PROBE_TILE, (float)params->crop_height - 0.01f);
+    Vec3 eye;
+    // Through the middle of a lens.
+    const Vec3 away = camera_ray(params, x + (float)params->crop_x, y + (float)params->crop_y, (Float)(0.0f),
+                                 (Float)(0.0f), &eye);
+    const Hits seen = closest_hits(params, MASK_ALL, eye, away, GEOMETRY_ARGUMENTS);
+    const Mask there = seen.triangle != NO_HIT;
+    const Vec3 wo = scale(away, (Float)(-1.0f));
+    const SurfacePoint s = surface_point(pick_u(there, seen.triangle, (UInt)(0u)), seen.u, seen.v, wo,
+                                         surfaces NORMAL_ARGUMENTS INSTANCE_ARGUMENTS);
+    Vec3 tangent;
+    Vec3 bitangent;
+    make_frame(s.ng, &tangent, &bitangent);
+    const Float square = unit_float(random[2]);
+    const Float radius = sqrt(square);
+    Float c;
+    Float si;
+    cos_sin_turns(unit_float(random[3]), &c, &si);
+    const Vec3 direction = renormalize3(add_scaled(
+        add_scaled(scale(tangent, radius * c), bitangent, radius * si), s.ng, sqrt(max(1.0f - square, 0.0f))));
+    const Hits hits = closest_hits(params, there, ray_origin(s, direction), direction, GEOMETRY_ARGUMENTS);
+    const Mask hit = there & (hits.triangle != NO_HIT);
+    const SurfacePoint beyond = surface_point(pick_u(hit, hits.triangle, (UInt)(0u)), hits.u, hits.v,
+                                              scale(direction, (Float)(-1.0f)), surfaces NORMAL_ARGUMENTS INSTANCE_ARGUMENTS);
+    // Tiles that are pooled share out the lights: a lattice in the plane.  Roberts: The Unreasonable
+    // Effectiveness of Quasirandom Sequences, 2018.
+    const UInt lattice = column * 0xc13fa9a9u + row * 0x91e10da5u;
+    const uint shift = params->first_pass * 0x9e3779b9u;
+    const Mask usual = ((column + row) & 1u) != 0u;
+    const LightChoice here = light_for_probe(params, lights CHOICE_ARGUMENTS, there, s, lattice + shift, usual);
+    const LightChoice later =
+        light_for_probe(params, lights CHOICE_ARGUMENTS, hit, beyond, lattice - shift, !usual);
+
+    const Float values[14] = {from_bits(pick_u(there, seen.triangle, (UInt)(NO_HIT))),
+                              seen.u,
+                              seen.v,
+                              from_bits(seed),
+                              direction.x,
+                              direction.y,
+                              direction.z,
+                              from_bits(here.light),
+                              wo.x,
+                              wo.y,
+                              wo.z,
+                              from_bits(later.light),
+                              here.pmf,
+                              later.pmf};
+    float lane[14][W];
+    for (uint k = 0; k < 14; ++k)
+        store_lanes(values[k], lane[k]);
+    const uint lanes = min(count - first, (uint)W);
+    for (uint k = 0; k < lanes; ++k)
+        vstore16((float16)(lane[0][k], lane[1][k], lane[2][k], lane[3][k], lane[4][k], lane[5][k], lane[6][k],
+                           lane[7][k], lane[8][k], lane[9][k], lane[10][k], lane[11][k], lane[12][k],
+                           lane[13][k], 0.0f, 0.0f),
+                 0, (__global float *)(probes + first + k));
+}
+
+// Tiles around a tile, in each direction, whose probes decide with its own.
+#define POOLED 3
+
+// A relative difference that may be rounding.
+#define DEAD_BAND 0.02f
+
+/// The relative difference beyond the dead band, 0 to 1.
+static inline float part_of(float difference, float larger)
+{
+    const float part = larger > 0.0f && larger < FLT_MAX ? difference / larger : 0.0f;
+    return clamp((part - DEAD_BAND) / (1.0f - DEAD_BAND), 0.0f, 1.0f);
+}
+
+/// Find how much light has changed around each probe: 0 not at all, 1 altogether.  One work item a probe.
+///
+/// reads   probes
+/// writes  changes
+kernel void pool_probes(__global const Params *params, __global const Probe *probes, __global float *changes)
+{
+    const int columns = (int)probe_columns(params);
+    const int rows = (int)probe_rows(params);
+    const int at = (int)get_global_id(0);
+    if (at >= columns * rows)
+        return;
+    const int row = at / columns;
+    const int column = at - row * columns;
+    float2 difference = (float2)(0.0f);
+    float2 larger = (float2)(0.0f);
+    for (int y = max(row - POOLED, 0); y <= min(row + POOLED, rows - 1); ++y)
+        for (int x = max(column - POOLED, 0); x <= min(column + POOLED, columns - 1); ++x) {
+            const float4 value = vload4(0, probes[y * columns + x].reflected);
+            // Lights that are seen outshine what they light: they only speak for themselves.
+            const float near = max(abs(x - column), abs(y - row)) <= 1u ? 1.0f : 0.0f;
+            const float2 weight = (float2)(1.0f, near);
+            difference += weight * fabs(value.yw - value.xz);
+            larger += weight * max(value.xz, value.yw);
+        }
+    changes[at] = max(part_of(difference.x, larger.x), part_of(difference.y, larger.y));
+}
