@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scene_builder import build, camera, floor, glowing, lambertian, render, renderer
 
+from psf_cl.device import layout
 from psf_cl.device.device import open_device
 from psf_cl.plan import make_plan
 from psf_cl.scene import primitives, transform
@@ -17,7 +18,7 @@ OUTPUTS = ("history", "alpha", "motion")
 SIZE = (40, 30)
 
 
-def room(size=SIZE, view=None):
+def room(size=SIZE, view=None, sky=0.2):
     """Return a lamp over a floor with a ball on it, under a sky."""
     over = transform.translation((0.5, 2.0, 0)) @ transform.rotation_xyz_degrees((180, 0, 0))
     ball = transform.translation((-0.3, 0.5, 0.5)) @ transform.scaling(0.5)
@@ -29,7 +30,7 @@ def room(size=SIZE, view=None):
         ],
         view or camera((0, 1.5, 3), (0, 0.5, 0), 45),
         size,
-        environment=0.2,
+        environment=sky,
     )
 
 
@@ -166,6 +167,114 @@ def test_sequences_have_the_same_bits_for_any_pool_and_any_number_of_looks(devic
             opened.snapshot()
         np.testing.assert_array_equal(opened.snapshot().rgb, image.rgb)
     opened.close()
+
+
+def dimmed(opened, factor):
+    """Let the lamp shine ``factor`` times as bright from now on."""
+    lights = opened.device.read(opened.buffers["lights"])
+    lights["intensity"][lights["kind"] == layout.CONSTANT["LIGHT_TRIANGLE"]] *= factor
+    opened.device.write(opened.buffers["lights"], lights)
+    materials = opened.device.read(opened.buffers["materials"])
+    materials["emission"] *= factor
+    opened.device.write(opened.buffers["materials"], materials)
+
+
+def switched(device, scene, frames, at, factor, **settings):
+    """Return the images of a still sequence whose lamp changes before frame ``at``."""
+    opened = renderer(device, scene, (*OUTPUTS, "gradient"), **settings)
+    images = []
+    set_params = opened._set_params
+    for frame in range(frames):
+        if frame:
+            # After the frame before has been kept, and before the new one looks for changes.
+            opened._set_params = set_params
+            if frame == at:
+                opened._set_params = lambda values: (dimmed(opened, factor), set_params(values))
+            opened.set_frame(frame / 24)
+        opened.render(spp=1)
+        images.append(opened.image())
+    opened.close()
+    return images
+
+
+def test_probes_find_nothing_while_only_the_camera_moves(device):
+    views = [camera((0.05 * k, 1.5, 3), (0, 0.5, 0), 45) for k in range(4)]
+    outputs = (*OUTPUTS, "gradient")
+    truth = sequence(device, room(), 4, views=views, temporal="cumulative")
+    images = sequence(device, room(), 4, views=views, outputs=outputs, temporal="adaptive")
+    for image, expected in zip(images, truth, strict=True):
+        np.testing.assert_array_equal(image.aovs["gradient"], 0.0)
+        assert image.rgb.tobytes() == expected.rgb.tobytes()
+
+
+def test_nothing_is_kept_of_a_light_that_is_switched_off(device):
+    """The lamp is all the light there is: what it lit begins anew, in the same frame."""
+    scene = room(sky=0.0)
+    images = switched(device, scene, 8, 6, 0.0, temporal="adaptive")
+    lit = images[5].rgb.max(axis=-1) > 0.0
+    assert lit.mean() > 0.4
+    np.testing.assert_array_equal(images[5].aovs["gradient"], 0.0)
+    assert (images[6].aovs["gradient"][lit] > 0.5).mean() > 0.98
+    assert (images[6].rgb[lit] == 0.0).mean() > 0.98
+    np.testing.assert_array_equal(images[7].aovs["gradient"], 0.0)
+
+
+def test_probes_find_how_much_of_the_light_has_changed(device):
+    scene = room((120, 90))
+    images = switched(device, scene, 2, 1, 0.0, temporal="adaptive")
+    opened = renderer(device, scene)
+    opened.render(spp=128)
+    on = opened.image().rgb.mean(axis=-1)
+    dimmed(opened, 0.0)
+    opened.set_frame(1.0)
+    opened.render(spp=128)
+    off = opened.image().rgb.mean(axis=-1)
+    opened.close()
+    found, truth = images[1].aovs["gradient"][..., 0], 1 - off / on
+    # Means over a few probes, and over their surroundings.
+    for low, high in ((0.1, 0.2), (0.2, 0.4), (0.4, 0.7)):
+        some = (truth > low) & (truth < high)
+        assert some.sum() > 100
+        assert found[some].mean() == pytest.approx(truth[some].mean(), abs=0.1)
+    assert np.median(found[np.abs(truth) < 0.01]) < 0.02
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.0, 0.5, 3.0])
+def test_adaptive_is_ahead_of_both_other_rules_when_a_light_changes(device, factor):
+    """As good as a fresh start after 4 frames, though it need not forget what has not changed."""
+    scene, at, frames = room((120, 90)), 12, 24
+    opened = renderer(device, scene)
+    dimmed(opened, factor)
+    opened.render(spp=1024)
+    after = opened.image().rgb
+    opened.close()
+    before = render(device, scene, 1024, seed=1).rgb
+
+    def error(image, truth):
+        return np.mean((image.rgb - truth) ** 2 / (truth**2 + 0.01))
+
+    opened = renderer(device, scene, temporal="cumulative")
+    dimmed(opened, factor)
+    fresh = []
+    for frame in range(frames - at):
+        if frame:
+            opened.set_frame(frame / 24)
+        opened.render(spp=1)
+        fresh.append(error(opened.image(), after))
+    opened.close()
+    errors = {
+        rule: [
+            error(image, before if frame < at else after)
+            for frame, image in enumerate(
+                switched(device, scene, frames, at, factor, temporal=rule)
+            )
+        ]
+        for rule in ("adaptive", "cumulative", "exponential")
+    }
+    assert errors["adaptive"][at + 3] < 1.1 * fresh[3]
+    assert errors["adaptive"][at + 7] < 1.1 * fresh[7]
+    assert sum(errors["adaptive"]) < min(sum(errors["cumulative"]), sum(errors["exponential"]))
 
 
 @pytest.mark.slow
