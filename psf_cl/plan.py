@@ -14,7 +14,7 @@ from psf_cl.errors import DeviceError, InputError
 from psf_cl.image import AOVS
 from psf_cl.instancing import Levels, split
 from psf_cl.measure.timing import Declared
-from psf_cl.motion import corner_labels, count_moving
+from psf_cl.motion import corner_labels, count_moving, lights_change
 from psf_cl.scene.model import (
     TEXTURE_FIELDS,
     Scene,
@@ -257,7 +257,7 @@ def make_plan(
     features = _features(scene, settings, outputs)
     features["FEW"] = _few(shown, corners, traits)
     features["INSTANCES"] = _instances(levels, shown)
-    features["TEMPORAL"] = _temporal(settings, features)
+    features["TEMPORAL"] = _temporal(scene, settings, features)
     if full:
         features = _all_on(features)
     pixel_count = width * height
@@ -556,7 +556,7 @@ def _cells(settings: Settings, glossy: bool) -> Feature:
     return Feature(1, "path_filter is hash_grid; every material is matt")
 
 
-def _temporal(settings: Settings, features: dict[str, Feature]) -> Feature:
+def _temporal(scene: Scene, settings: Settings, features: dict[str, Feature]) -> Feature:
     """Return whether frames share light: 2 if they also look for where it changes."""
     if settings.temporal == "off":
         return Feature(0, "temporal is off")
@@ -564,6 +564,8 @@ def _temporal(settings: Settings, features: dict[str, Feature]) -> Feature:
         return Feature(1, f"temporal is {settings.temporal}")
     if not features["CONNECT"].value:
         return Feature(1, "temporal is adaptive, but no light is sampled whose changes probes see")
+    if count_moving(scene) is None and not lights_change(scene):
+        return Feature(1, "temporal is adaptive, but nothing changes the light")
     return Feature(2, "temporal is adaptive: probes look for changes of light")
 
 

@@ -264,8 +264,8 @@ class Renderer:
                 self._change_lights()
             values["history_flags"] = self._history_flags(before, values) if whole else 0
             self._set_params(values | {"first_pass": first})
-            for launch, items in self.change_launches if whole else ():
-                launch(items)
+            if whole:
+                self._find_changes()
             self.device.wait()
         finally:
             self.scheduler.clock.stop()
@@ -278,6 +278,14 @@ class Renderer:
                 launch(items, film.GROUP)
             for launch, items in self.probe_launches:
                 launch(items)
+
+    def _find_changes(self) -> None:
+        """Find where light has changed since the frame before, if that is asked for."""
+        if self.lights_change or (self.mover is not None and self.mover.moved):
+            for launch, items in self.change_launches:
+                launch(items)
+        elif "changes" in self.buffers:
+            self.device.fill(self.buffers["changes"])
 
     def _history_flags(self, before: np.ndarray, values: Mapping[str, Any]) -> int:
         """Return what ``Params.history_flags`` say of the frame that begins."""

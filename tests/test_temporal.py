@@ -8,25 +8,42 @@ import numpy as np
 import pytest
 from scene_builder import build, camera, floor, glowing, lambertian, render, renderer
 
-from psf_cl.device import layout
 from psf_cl.device.device import open_device
 from psf_cl.plan import make_plan
 from psf_cl.scene import primitives, transform
+from psf_cl.scene.curve import Curve
 from psf_cl.settings import Settings
 
-OUTPUTS = ("history", "alpha", "motion")
+OUTPUTS = ("history", "alpha", "motion", "gradient")
 SIZE = (40, 30)
 
 
-def room(size=SIZE, view=None, sky=0.2):
-    """Return a lamp over a floor with a ball on it, under a sky."""
+LAMP = np.array((8.0, 6.0, 4.0))
+
+
+def room(size=SIZE, view=None, sky=0.2, factor=1.0, change=None):
+    """Return a lamp over a floor with a ball on it, under a sky.
+
+    Args:
+        factor: of the lamp's radiance.
+        change: (frame, factor from it on), or None if the lamp stays as it is.
+    """
+    curve = None
+    if change is not None:
+        times = np.array((0.0, change[0] / 24))
+        curve = Curve(times, np.array((LAMP, LAMP * change[1])), "step")
     over = transform.translation((0.5, 2.0, 0)) @ transform.rotation_xyz_degrees((180, 0, 0))
     ball = transform.translation((-0.3, 0.5, 0.5)) @ transform.scaling(0.5)
+    shade = glowing(LAMP * factor, emission_curve=curve)
     return build(
         [
             floor(3.0, lambertian((0.7, 0.5, 0.3))),
             (primitives.sphere(8, 6), ball, lambertian((0.3, 0.6, 0.8))),
-            (primitives.quad(), over @ transform.scaling(0.3), glowing((8.0, 6.0, 4.0))),
+            (
+                primitives.quad(),
+                over @ transform.scaling(0.3),
+                shade,
+            ),
         ],
         view or camera((0, 1.5, 3), (0, 0.5, 0), 45),
         size,
@@ -41,7 +58,7 @@ def sequence(device, scene, frames, spp=1, views=(), outputs=OUTPUTS, **settings
     for frame in range(frames):
         if frame:
             if views:
-                opened.scene = replace(opened.scene, cameras=(views[frame],))
+                opened.moving = replace(opened.moving, cameras=(views[frame],))
             opened.set_frame(frame / 24)
         opened.render(spp=spp)
         images.append(opened.image())
@@ -82,8 +99,11 @@ def test_a_frame_of_more_samples_weighs_more(device):
 
 
 def test_adaptive_has_the_bits_of_cumulative_while_nothing_changes(device):
-    truth = sequence(device, room(), 6, temporal="cumulative")
-    images = sequence(device, room(), 6, temporal="adaptive")
+    # The lamp has a curve, so that probes look at it.
+    scene = room(change=(3, 1.0))
+    assert make_plan(scene, Settings(temporal="adaptive")).features["TEMPORAL"].value == 2
+    truth = sequence(device, scene, 6, temporal="cumulative")
+    images = sequence(device, scene, 6, temporal="adaptive")
     for image, expected in zip(images, truth, strict=True):
         assert image.rgb.tobytes() == expected.rgb.tobytes()
 
@@ -160,7 +180,7 @@ def test_sequences_have_the_same_bits_for_any_pool_and_any_number_of_looks(devic
     opened = renderer(small, room(), **settings)
     for view, image in zip(views, truth, strict=True):
         if view is not views[0]:
-            opened.scene = replace(opened.scene, cameras=(view,))
+            opened.moving = replace(opened.moving, cameras=(view,))
             opened.set_frame(0.0)
         for _ in range(2):
             opened.step()
@@ -169,39 +189,11 @@ def test_sequences_have_the_same_bits_for_any_pool_and_any_number_of_looks(devic
     opened.close()
 
 
-def dimmed(opened, factor):
-    """Let the lamp shine ``factor`` times as bright from now on."""
-    lights = opened.device.read(opened.buffers["lights"])
-    lights["intensity"][lights["kind"] == layout.CONSTANT["LIGHT_TRIANGLE"]] *= factor
-    opened.device.write(opened.buffers["lights"], lights)
-    materials = opened.device.read(opened.buffers["materials"])
-    materials["emission"] *= factor
-    opened.device.write(opened.buffers["materials"], materials)
-
-
-def switched(device, scene, frames, at, factor, **settings):
-    """Return the images of a still sequence whose lamp changes before frame ``at``."""
-    opened = renderer(device, scene, (*OUTPUTS, "gradient"), **settings)
-    images = []
-    set_params = opened._set_params
-    for frame in range(frames):
-        if frame:
-            # After the frame before has been kept, and before the new one looks for changes.
-            opened._set_params = set_params
-            if frame == at:
-                opened._set_params = lambda values: (dimmed(opened, factor), set_params(values))
-            opened.set_frame(frame / 24)
-        opened.render(spp=1)
-        images.append(opened.image())
-    opened.close()
-    return images
-
-
 def test_probes_find_nothing_while_only_the_camera_moves(device):
     views = [camera((0.05 * k, 1.5, 3), (0, 0.5, 0), 45) for k in range(4)]
-    outputs = (*OUTPUTS, "gradient")
-    truth = sequence(device, room(), 4, views=views, temporal="cumulative")
-    images = sequence(device, room(), 4, views=views, outputs=outputs, temporal="adaptive")
+    scene = room(change=(2, 1.0))
+    truth = sequence(device, scene, 4, views=views, temporal="cumulative")
+    images = sequence(device, scene, 4, views=views, temporal="adaptive")
     for image, expected in zip(images, truth, strict=True):
         np.testing.assert_array_equal(image.aovs["gradient"], 0.0)
         assert image.rgb.tobytes() == expected.rgb.tobytes()
@@ -209,8 +201,8 @@ def test_probes_find_nothing_while_only_the_camera_moves(device):
 
 def test_nothing_is_kept_of_a_light_that_is_switched_off(device):
     """The lamp is all the light there is: what it lit begins anew, in the same frame."""
-    scene = room(sky=0.0)
-    images = switched(device, scene, 8, 6, 0.0, temporal="adaptive")
+    scene = room(sky=0.0, change=(6, 0.0))
+    images = sequence(device, scene, 8, temporal="adaptive")
     lit = images[5].rgb.max(axis=-1) > 0.0
     assert lit.mean() > 0.4
     np.testing.assert_array_equal(images[5].aovs["gradient"], 0.0)
@@ -220,16 +212,11 @@ def test_nothing_is_kept_of_a_light_that_is_switched_off(device):
 
 
 def test_probes_find_how_much_of_the_light_has_changed(device):
-    scene = room((120, 90))
-    images = switched(device, scene, 2, 1, 0.0, temporal="adaptive")
-    opened = renderer(device, scene)
-    opened.render(spp=128)
-    on = opened.image().rgb.mean(axis=-1)
-    dimmed(opened, 0.0)
-    opened.set_frame(1.0)
-    opened.render(spp=128)
-    off = opened.image().rgb.mean(axis=-1)
-    opened.close()
+    size = (120, 90)
+    images = sequence(device, room(size, change=(1, 0.0)), 2, temporal="adaptive")
+    on, off = (
+        render(device, room(size, factor=factor), 128).rgb.mean(axis=-1) for factor in (1.0, 0.0)
+    )
     found, truth = images[1].aovs["gradient"][..., 0], 1 - off / on
     # Means over a few probes, and over their surroundings.
     for low, high in ((0.1, 0.2), (0.2, 0.4), (0.4, 0.7)):
@@ -243,32 +230,19 @@ def test_probes_find_how_much_of_the_light_has_changed(device):
 @pytest.mark.parametrize("factor", [0.0, 0.5, 3.0])
 def test_adaptive_is_ahead_of_both_other_rules_when_a_light_changes(device, factor):
     """As good as a fresh start after 4 frames, though it need not forget what has not changed."""
-    scene, at, frames = room((120, 90)), 12, 24
-    opened = renderer(device, scene)
-    dimmed(opened, factor)
-    opened.render(spp=1024)
-    after = opened.image().rgb
-    opened.close()
-    before = render(device, scene, 1024, seed=1).rgb
+    size, at, frames = (120, 90), 12, 24
+    scene, later = room(size, change=(at, factor)), room(size, factor=factor)
+    before, after = render(device, room(size), 1024, seed=1).rgb, render(device, later, 1024).rgb
 
     def error(image, truth):
         return np.mean((image.rgb - truth) ** 2 / (truth**2 + 0.01))
 
-    opened = renderer(device, scene, temporal="cumulative")
-    dimmed(opened, factor)
-    fresh = []
-    for frame in range(frames - at):
-        if frame:
-            opened.set_frame(frame / 24)
-        opened.render(spp=1)
-        fresh.append(error(opened.image(), after))
-    opened.close()
+    images = sequence(device, later, frames - at, temporal="cumulative")
+    fresh = [error(image, after) for image in images]
     errors = {
         rule: [
             error(image, before if frame < at else after)
-            for frame, image in enumerate(
-                switched(device, scene, frames, at, factor, temporal=rule)
-            )
+            for frame, image in enumerate(sequence(device, scene, frames, temporal=rule))
         ]
         for rule in ("adaptive", "cumulative", "exponential")
     }
