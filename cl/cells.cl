@@ -227,6 +227,9 @@ static inline void look_up_samples(
     __global const Seen *seen,
     __global float *base,
 #endif
+#if RESTORE
+    __global Lost *film_lost,
+#endif
     __global float *samples,
     uint first,
     const PassPlace *place)
@@ -254,10 +257,23 @@ static inline void look_up_samples(
                            from_bits(GATHER_U(cells, at, low[2])));
     Vec3 light = mul(load_gate(vertices, pixel), mean);
     const Mask alone = wanted & !found;
+#if RESTORE
+    const Vec3 own = load_beyond(beyond, pixel);
+#endif
     if (any_lane(alone)) {
         light = pick_v(alone, load_beyond(beyond, pixel), light);
         count_up(&counters[COUNTER_UNFILTERED_SAMPLES], count_lanes(alone));
     }
+#if RESTORE
+    const Vec3 lost = sub(own, light);
+    const float sign = pass_is_in_half(place->pass - params->first_pass) ? -1.0f : 1.0f;
+    const Float brightness = sign * (0.2126f * lost.x + 0.7152f * lost.y + 0.0722f * lost.z);
+    float lane_lost[4][W];
+    store_lanes(lost.x, lane_lost[0]);
+    store_lanes(lost.y, lane_lost[1]);
+    store_lanes(lost.z, lane_lost[2]);
+    store_lanes(brightness, lane_lost[3]);
+#endif
     float lane_light[3][W];
     store_lanes(light.x, lane_light[0]);
     store_lanes(light.y, lane_light[1]);
@@ -265,7 +281,16 @@ static inline void look_up_samples(
     for (uint left = lane_bits(wanted); left; left &= left - 1u) {
         const uint i = lowest_bit(left);
         const float4 more = (float4)(lane_light[0][i], lane_light[1][i], lane_light[2][i], 0.0f);
-        vstore4(vload4(first + i, samples) + more, first + i, samples);
+        const float4 before = vload4(first + i, samples);
+        vstore4(before + more, first + i, samples);
+#if RESTORE
+        // Of a sample that the film does not take nothing is known.
+        if (before.w > 0.0f) {
+            __global float *sums = (__global float *)&film_lost[first + i];
+            const float4 all = (float4)(lane_lost[0][i], lane_lost[1][i], lane_lost[2][i], lane_lost[3][i]);
+            vstore4(vload4(0, sums) + all, 0, sums);
+        }
+#endif
 #if BASE
         vstore4(vload4(first + i, base) + more * base_share_of(beyond, seen, first + i), first + i, base);
 #endif
@@ -276,7 +301,7 @@ static inline void look_up_samples(
 /// or the sample's own where there is none.  One work item W pixels, RUN times, after resolve_cells.
 ///
 /// reads   beyond, vertices, cell_keys, cells, full_buckets, seen
-/// writes  samples, base; counters.unfiltered_samples (atomic)
+/// writes  samples, base, film_lost; counters.unfiltered_samples (atomic)
 kernel void look_up_cells(
     __global const Params *params,
     __global const Beyond *beyond,
@@ -288,6 +313,9 @@ kernel void look_up_cells(
 #if BASE
     __global const Seen *seen,
     __global float *base,
+#endif
+#if RESTORE
+    __global Lost *film_lost,
 #endif
     __global float *samples)
 {
@@ -301,6 +329,9 @@ kernel void look_up_cells(
                             cell_keys + place.slots, cells + place.slots, full_buckets + place.buckets,
 #if BASE
                             seen + place.samples, base + 4 * place.samples,
+#endif
+#if RESTORE
+                            film_lost,
 #endif
                             samples + 4 * place.samples, i, &place);
     }

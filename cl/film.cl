@@ -60,16 +60,6 @@ kernel void add_samples(
     }
 }
 
-/// Whether a pass belongs to the second half of the samples.
-///
-/// Halves have to differ as independent renders would.  Every other Sobol' point would not do: these
-/// are opposites in the first dimension.  Runs of about sqrt(pass) points have each half the pattern
-/// of a whole sequence; the halves are equal whenever the number of passes is a power of two.
-static inline int pass_is_in_half(uint pass)
-{
-    return (pass >> ((31u - clz(pass | 1u)) >> 1)) & 1u;
-}
-
 /// Add every complete pass of the second half.  One work item W pixels, before advance_film.
 ///
 /// reads   samples, counters

@@ -37,6 +37,7 @@ from psf_cl.stages import (
     intersect,
     metropolis,
     probes,
+    restore,
     screen,
     seen,
     shade,
@@ -298,6 +299,7 @@ def make_plan(
         temporal,
         screen,
         guide,
+        restore,
     ):
         stage = module.plan(context)
         if stage is not None:
@@ -519,6 +521,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "guiding is off",
         ),
         "CELLS": _cells(settings, glossy),
+        "RESTORE": _restore(settings),
         "SEEN": _seen(settings, outputs),
         "BASE": _base(settings, glossy),
         "METROPOLIS": switch(
@@ -535,6 +538,17 @@ def _motion(scene: Scene) -> Feature:
     if moving is None:
         return Feature(0, "no triangle moves")
     return Feature(1, f"{moving.triangles} triangles move between frames")
+
+
+def _restore(settings: Settings) -> Feature:
+    """Return whether what averages per cell lost is added back."""
+    if settings.path_filter == "off":
+        return Feature(0, "path_filter is off")
+    if not settings.filter_restore:
+        return Feature(0, "filter_restore is false: averages stay as they are")
+    if settings.screen_filter != "off" or settings.temporal != "off":
+        return Feature(0, "screen_filter or temporal is on, and goes on with the averages")
+    return Feature(1, "filter_restore puts back what averages per cell lost")
 
 
 def _lens(scene: Scene) -> Feature:
@@ -612,7 +626,7 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     # Directions would be drawn otherwise: the image would have other noise.
     full["GUIDE"] = features["GUIDE"]
     if features["METROPOLIS"].value:
-        names = ("AOV_DIRECT", "AOV_FEATURES", "BASE", "CELLS", "SEEN")
+        names = ("AOV_DIRECT", "AOV_FEATURES", "BASE", "CELLS", "RESTORE", "SEEN")
         full |= {name: features[name] for name in names}
     # Without anything to move there is nothing to hold.
     full["MOTION"] = features["MOTION"]

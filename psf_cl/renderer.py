@@ -39,7 +39,7 @@ from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Scene
 from psf_cl.scheduler import Hooks, Progress, Scheduler, doubling_epoch
 from psf_cl.settings import Settings, resolve
-from psf_cl.stages import cells, film, guide, metropolis, probes, screen, temporal
+from psf_cl.stages import cells, film, guide, metropolis, probes, restore, screen, temporal
 
 #: Looks of the host at the counters for each count of the paths by depth, which takes 0.4 ms on two
 #: CPU cores; the first look, which is left out, is at a pool that is still empty.
@@ -335,7 +335,7 @@ class Renderer:
             counters[layout.COUNTER_INDEX[name]] = first
         self.device.write(self.buffers["counters"], counters)
         names = (name for ring, sums, _ in film.PLANES for name in (ring, sums))
-        for name in ("pool", "splats", "film_half", "surfaces_seen", *names):
+        for name in ("pool", "splats", "film_half", "film_lost", "surfaces_seen", *names):
             if name in self.buffers:
                 self.device.fill(self.buffers[name])
 
@@ -471,7 +471,9 @@ class Renderer:
         if "film_direct" in sums:
             aovs["direct"] = mean(sums["film_direct"][0])
             aovs["indirect"] = aovs["rgb"] - aovs["direct"]
-        if self.picture_launches and not partial:
+        if self._restores() and not partial:
+            aovs["rgb"] = self._restored(counters)
+        elif self.picture_launches and not partial:
             aovs["rgb"] = self._picture()
         if "film_features" in sums:
             aovs["albedo"], aovs["normal"], depth = (mean(plane) for plane in sums["film_features"])
@@ -529,6 +531,20 @@ class Renderer:
             name: self._in_rows(values.reshape(self.plan.pixel_count, -1))
             for name, values in aovs.items()
         }
+
+    def _restores(self) -> bool:
+        """Return whether the image gets back what averages lost; not if that is only built in."""
+        wanted = self.settings.filter_restore and self.settings.path_filter != "off"
+        alone = self.settings.screen_filter == self.settings.temporal == "off"
+        return wanted and alone
+
+    def _restored(self, counters: np.ndarray) -> np.ndarray:
+        """Return the image with what averages per cell lost, ``(h, w, 3)``."""
+        passes = int(counters[layout.COUNTER_INDEX["film_pass"]]) - self.scheduler.first
+        self.restore_launches[0][0].set(tilt=restore.tilt(passes))
+        for launch, items in self.restore_launches:
+            launch(items, film.GROUP)
+        return self._in_rows(self.device.read(self.buffers["restored"]).reshape(-1, 4)[:, :3])
 
     def save(self, path: str | os.PathLike[str]) -> bool:
         """Write a checkpoint, if this is a moment for one.
@@ -964,6 +980,7 @@ class Renderer:
             programs["seen"].bind_planned("add_seen", self.buffers) if "seen" in programs else None
         )
         self._bind_pictures(programs)
+        self._bind_restore(programs.get("restore"))
         self.advance = self.film_program.bind_planned("advance_film", self.buffers)
         if self.statistics:
             self.census = self.film_program.bind(
@@ -1019,6 +1036,28 @@ class Renderer:
         ]
         self.clear_cells = program.bind_planned("clear_cells", self.buffers)
         self.add_unfiltered = program.bind_planned("add_unfiltered", self.buffers)
+
+    def _bind_restore(self, program: Program | None) -> None:
+        self.restore_launches: list[tuple[Launch, int]] = []
+        if program is None:
+            return
+        names = ("params", "film", "film_lost", "unrestored", "rows", "restored")
+        params, sums, lost, unrestored, rows, restored = (self.buffers[name] for name in names)
+        pixels = self.plan.pixel_count
+        items = -(-pixels // self.plan.traits.lanes)
+        state = {"params": params, "unrestored": unrestored}
+        take = program.bind(
+            "take_lost", film=sums, film_lost=lost, restored=restored, tilt=1.0, **state
+        )
+        self.restore_launches.append((take, pixels))
+        for radius in restore.RADII:
+            add_up = program.bind("sum_rows", rows=rows, radius=radius, **state)
+            add = program.bind(
+                "restore_windows", rows=rows, restored=restored, radius=radius, **state
+            )
+            self.restore_launches += [(add_up, items), (add, items)]
+        last = program.bind("restore_pixels", restored=restored, **state)
+        self.restore_launches.append((last, items))
 
     def _bind_chains(self, program: Program | None) -> None:
         self.splat_launches: list[Launch] = []

@@ -76,6 +76,9 @@
 #ifndef CELLS
 #error "CELLS must be 0, 1 (all of a vertex's light is shared) or 2 (that of its diffuse base)"
 #endif
+#ifndef RESTORE
+#error "RESTORE must be 0 or 1 (what averages per cell take from a pixel is kept apart)"
+#endif
 #ifndef METROPOLIS
 #error "METROPOLIS must be 0 or 1 (paths are those of chains)"
 #endif

@@ -571,6 +571,12 @@ typedef struct {
     uint vertex; // 1 + its depth, VERTEX_NEAR, VERTEX_REJECTED; 0 if there is none
 } Beyond;
 
+/// What averages per cell took from a pixel: sums over its samples, or a mean and its variance.
+typedef struct {
+    float rgb[3]; // its own radiance minus that of the averages
+    float difference; // of its luminance between two halves of the samples; of a mean its variance
+} Lost;
+
 /// What a cell gathers: 64-bit fixed-point sums.
 typedef struct {
     uint low[3]; // of radiance; from resolve_cells on the bits of their mean, a float

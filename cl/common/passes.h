@@ -19,3 +19,13 @@ static inline uint complete_passes(__global const Params *params, const volatile
         ++done;
     return done;
 }
+
+/// Whether a pass belongs to the second half of the samples.
+///
+/// Halves have to differ as independent renders would.  Every other Sobol' point would not do: these
+/// are opposites in the first dimension.  Runs of about sqrt(pass) points have each half the pattern
+/// of a whole sequence; the halves are equal whenever the number of passes is a power of two.
+static inline int pass_is_in_half(uint pass)
+{
+    return (pass >> ((31u - clz(pass | 1u)) >> 1)) & 1u;
+}

@@ -518,6 +518,15 @@ BEYOND = Record(
     """),
 )
 
+LOST = Record(
+    "Lost",
+    "What averages per cell took from a pixel: sums over its samples, or a mean and its variance.",
+    _fields("""
+    float rgb[3] - its own radiance minus that of the averages
+    float difference - of its luminance between two halves of the samples; of a mean its variance
+    """),
+)
+
 CELL = Record(
     "Cell",
     "What a cell gathers: 64-bit fixed-point sums.",
@@ -593,6 +602,7 @@ RECORDS = (
     PROBE,
     CELL_VERTEX,
     BEYOND,
+    LOST,
     CELL,
     SPLAT_SUM,
     GUIDE_SUM,

@@ -137,7 +137,7 @@ def plan(context: Context) -> StageSpec | None:
         "cells",
         "light is shared by the paths that meet in a cell",
         "cells.cl",
-        flags=("BASE", "CELLS"),
+        flags=("BASE", "CELLS", "RESTORE"),
         kernels=kernels,
         buffers=buffers,
         per_pass=True,

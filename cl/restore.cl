@@ -1,0 +1,184 @@
+// What averages per cell took from the picture is added back as far as it stands out of the noise.
+//
+// Each pixel knows the mean of what its own samples had more than the averages that they used: the bias of
+// the filter, with the noise of plain path tracing.  Averaged over a window that noise is less; what is then
+// left above it is bias, and goes back into the picture: first over large windows, then over smaller ones,
+// at last pixel by pixel.  With ever more samples all of it goes back: the picture becomes that of plain
+// path tracing.
+//
+// James, Stein: Estimation with Quadratic Loss, 1961 (shrinking by the part that is noise).
+
+#include "common/lanes.h"
+#include "common/layout.h"
+#include "common/pixels.h"
+
+// How much of a squared mean counts as noise, in variances of it.
+#define NOISE 2.0f
+
+static inline Float luminance_of(Vec3 v) { return 0.2126f * v.x + 0.7152f * v.y + 0.0722f * v.z; }
+
+static inline Vec3 gather_lost(__global const Lost *lost, UInt pixel)
+{
+    return vec3(GATHER(lost, pixel, rgb[0]), GATHER(lost, pixel, rgb[1]), GATHER(lost, pixel, rgb[2]));
+}
+
+/// Part of a mean that is not noise, of the square of its luminance and its variance.
+static inline Float sure_part(Float square, Float variance)
+{
+    return max(square - NOISE * variance, (Float)(0.0f)) / max(square, (Float)(1e-37f));
+}
+
+/// Column and row of W pixels in the crop.
+static inline void place_in_crop(__global const Params *params, UInt pixel, UInt *column, UInt *row)
+{
+    pixel_place(params, pixel, column, row);
+    *column -= params->crop_x;
+    *row -= params->crop_y;
+}
+
+/// Turn sums into means, with their variances in `difference`, and take the picture from the film.  One
+/// work item a pixel.
+///
+/// The noise shows in the difference between two halves of the samples; `tilt` is what one half has more of
+/// all, and 1 where nothing can be told.  Of few samples the halves often look too much alike, for bright ones
+/// are rare: their noise is taken for larger.
+///
+/// reads   film, film_lost
+/// writes  unrestored, restored
+kernel void take_lost(
+    __global const Params *params,
+    __global const FilmSum *film,
+    __global const Lost *film_lost,
+    __global Lost *unrestored,
+    __global float *restored,
+    const float tilt)
+{
+    const uint pixel = get_global_id(0);
+    if (pixel >= params->pixel_count)
+        return;
+    const float count = (float)max(film[pixel].count, 1u);
+    float mean = 0.0f;
+    const float weights[3] = {0.2126f, 0.7152f, 0.0722f};
+    for (uint c = 0; c < 3; ++c) {
+        restored[4 * pixel + c] = (film[pixel].sum[c] - film[pixel].lost[c]) / count;
+        const float lost = fabs(tilt) < 1.0f ? film_lost[pixel].rgb[c] / count : 0.0f;
+        unrestored[pixel].rgb[c] = lost;
+        mean += weights[c] * lost;
+    }
+    const float difference = film_lost[pixel].difference / count - tilt * mean;
+    const float variance = difference * difference / max(1.0f - tilt * tilt, 1e-6f);
+    unrestored[pixel].difference = variance * (1.0f + 4.0f / max(count - 1.0f, 1.0f));
+}
+
+/// Sum what is left over windows of a row, `radius` pixels to either side.  One work item W pixels.
+///
+/// reads   unrestored
+/// writes  rows
+kernel void sum_rows(
+    __global const Params *params, __global const Lost *unrestored, __global Lost *rows, const uint radius)
+{
+    const uint first = get_global_id(0) * W;
+    if (first >= params->pixel_count)
+        return;
+    const UInt wanted = lanes_before(MASK_ALL) + first;
+    const UInt pixel = min(wanted, (UInt)(params->pixel_count - 1u));
+    UInt column;
+    UInt row;
+    place_in_crop(params, pixel, &column, &row);
+    Vec3 sum = vec3_all((Float)(0.0f));
+    Float variance = (Float)(0.0f);
+    for (uint k = 0; k <= 2u * radius; ++k) {
+        const UInt x = column + k - radius;
+        const Mask inside = x < params->crop_width;
+        const UInt at = pixel_entry(params, pick_u(inside, x, column), row);
+        sum = add(sum, pick_v(inside, gather_lost(unrestored, at), vec3_all((Float)(0.0f))));
+        variance += pick(inside, GATHER(unrestored, at, difference), (Float)(0.0f));
+    }
+    float lane[4][W];
+    store_lanes(sum.x, lane[0]);
+    store_lanes(sum.y, lane[1]);
+    store_lanes(sum.z, lane[2]);
+    store_lanes(variance, lane[3]);
+    for (uint k = 0; k < min((uint)W, params->pixel_count - first); ++k)
+        vstore4((float4)(lane[0][k], lane[1][k], lane[2][k], lane[3][k]), first + k, (__global float *)rows);
+}
+
+/// Add back what stands out in windows of the picture, `radius` pixels to each side.  One work item W
+/// pixels, after sum_rows.
+///
+/// reads   rows
+/// writes  unrestored, restored
+kernel void restore_windows(
+    __global const Params *params,
+    __global const Lost *rows,
+    __global Lost *unrestored,
+    __global float *restored,
+    const uint radius)
+{
+    const uint first = get_global_id(0) * W;
+    if (first >= params->pixel_count)
+        return;
+    const UInt wanted = lanes_before(MASK_ALL) + first;
+    const UInt pixel = min(wanted, (UInt)(params->pixel_count - 1u));
+    UInt column;
+    UInt row;
+    place_in_crop(params, pixel, &column, &row);
+    Vec3 sum = vec3_all((Float)(0.0f));
+    Float variance = (Float)(0.0f);
+    for (uint k = 0; k <= 2u * radius; ++k) {
+        const UInt y = row + k - radius;
+        const Mask inside = y < params->crop_height;
+        const UInt at = pixel_entry(params, column, pick_u(inside, y, row));
+        sum = add(sum, pick_v(inside, gather_lost(rows, at), vec3_all((Float)(0.0f))));
+        variance += pick(inside, GATHER(rows, at, difference), (Float)(0.0f));
+    }
+    const UInt wide = min(column + radius, (UInt)(params->crop_width - 1u)) - (column - min(column, (UInt)(radius)));
+    const UInt high = min(row + radius, (UInt)(params->crop_height - 1u)) - (row - min(row, (UInt)(radius)));
+    const Float inverse = 1.0f / to_float((wide + 1u) * (high + 1u));
+    const Vec3 mean = scale(sum, inverse);
+    const Float y = luminance_of(mean);
+    const Vec3 back = scale(mean, sure_part(y * y, variance * inverse * inverse));
+    float lane[3][W];
+    store_lanes(back.x, lane[0]);
+    store_lanes(back.y, lane[1]);
+    store_lanes(back.z, lane[2]);
+    for (uint k = 0; k < min((uint)W, params->pixel_count - first); ++k)
+        for (uint c = 0; c < 3; ++c) {
+            unrestored[first + k].rgb[c] -= lane[c][k];
+            restored[4 * (first + k) + c] += lane[c][k];
+        }
+}
+
+/// Add back what stands out in a pixel, judged by it and its neighbours.  One work item W pixels.
+///
+/// reads   unrestored
+/// writes  restored
+kernel void restore_pixels(__global const Params *params, __global const Lost *unrestored, __global float *restored)
+{
+    const uint first = get_global_id(0) * W;
+    if (first >= params->pixel_count)
+        return;
+    const UInt wanted = lanes_before(MASK_ALL) + first;
+    const UInt pixel = min(wanted, (UInt)(params->pixel_count - 1u));
+    UInt column;
+    UInt row;
+    place_in_crop(params, pixel, &column, &row);
+    Float square = (Float)(0.0f);
+    Float variance = (Float)(0.0f);
+    for (uint k = 0; k < 9u; ++k) {
+        const UInt x = min(max(column + k % 3u, (UInt)(1u)) - 1u, (UInt)(params->crop_width - 1u));
+        const UInt y = min(max(row + k / 3u, (UInt)(1u)) - 1u, (UInt)(params->crop_height - 1u));
+        const UInt at = pixel_entry(params, x, y);
+        const Float value = luminance_of(gather_lost(unrestored, at));
+        square += value * value;
+        variance += GATHER(unrestored, at, difference);
+    }
+    const Vec3 back = scale(gather_lost(unrestored, pixel), sure_part(square, variance));
+    float lane[3][W];
+    store_lanes(back.x, lane[0]);
+    store_lanes(back.y, lane[1]);
+    store_lanes(back.z, lane[2]);
+    for (uint k = 0; k < min((uint)W, params->pixel_count - first); ++k)
+        for (uint c = 0; c < 3; ++c)
+            restored[4 * (first + k) + c] += lane[c][k];
+}

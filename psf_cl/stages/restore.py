@@ -1,0 +1,48 @@
+"""Restore: what averages per cell took from the picture goes back where it is no noise."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from psf_cl.device import layout
+from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
+
+#: Pixels to each side of the windows in which it is looked for, one after the other.
+RADII = (8, 2)
+
+
+def tilt(passes: int) -> float:
+    """Return how much more of so many passes the first half has than the second, of 1 in all.
+
+    The halves are those of ``pass_is_in_half`` (``cl/common/passes.h``).
+    """
+    if passes < 1:
+        return 1.0
+    numbers = np.arange(passes, dtype=np.int64)
+    run = np.frexp(np.maximum(numbers, 1))[1] - 1 >> 1
+    return float(1.0 - 2.0 * ((numbers >> run) & 1).mean())
+
+
+def plan(context: Context) -> StageSpec | None:
+    """Return the stage, or None if nothing is put back."""
+    if not context.on("RESTORE"):
+        return None
+    pixels, lost = context.pixel_count, layout.LOST.dtype
+    return StageSpec(
+        "restore",
+        "what averages lost is added back before the picture is handed out",
+        "restore.cl",
+        kernels=(
+            KernelSpec("take_lost", lanes=False),
+            KernelSpec("sum_rows"),
+            KernelSpec("restore_windows"),
+            KernelSpec("restore_pixels"),
+        ),
+        buffers=(
+            BufferSpec("film_lost", lost, pixels, "sums of what averages took from the pixels"),
+            BufferSpec("unrestored", lost, pixels, "of that, what is not put back yet", True),
+            BufferSpec("rows", lost, pixels, "the same, summed over rows", True),
+            BufferSpec("restored", np.dtype(np.float32), 4 * pixels, "the picture with it", True),
+        ),
+        per_pass=True,
+    )

@@ -1,0 +1,126 @@
+"""What averages per cell lost goes back: against a model in NumPy, and plain path tracing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scene_builder import LUMINANCE, render, renderer
+from test_cells import FILTER, room
+
+from psf_cl.device.device import open_device
+from psf_cl.plan import make_plan
+from psf_cl.settings import Settings, preset_values
+from psf_cl.stages.restore import RADII
+
+SIZE = (38, 26)
+RESTORE = {**FILTER, "filter_vertex": "1", "filter_restore": True, "cell_shrink": False}
+
+
+def windows(image, radius):
+    """Return the sums of ``image`` over windows cut at its edges, and their pixels."""
+    sums, counts = np.zeros_like(image), np.zeros(image.shape[:2])
+    height, width = image.shape[:2]
+    for y in range(height):
+        for x in range(width):
+            part = image[max(y - radius, 0) : y + radius + 1, max(x - radius, 0) : x + radius + 1]
+            sums[y, x] = part.sum(axis=(0, 1))
+            counts[y, x] = part.shape[0] * part.shape[1]
+    return sums, counts
+
+
+def model(opened):
+    """Return the picture that the film and what it lost make."""
+    width, height = SIZE
+    film, lost = (opened.device.read(opened.buffers[name]) for name in ("film", "film_lost"))
+
+    def picture(values):
+        image = np.zeros((width * height, values.shape[-1]))
+        image[opened.order] = values
+        return image.reshape(height, width, -1)
+
+    count = film["count"].astype(np.float64)[:, None]
+    image = picture((film["sum"] - film["lost"]) / count)
+    mean = lost["rgb"] / count
+    # Runs of about sqrt(pass) passes take turns between the halves.
+    passes = np.arange(int(count[0, 0]))
+    runs = 2 ** (np.floor(np.log2(np.maximum(passes, 1))).astype(int) // 2)
+    first = 1 - 2 * (passes // runs % 2).mean()
+    difference = lost["difference"][:, None] / count - first * (mean @ LUMINANCE)[:, None]
+    left, variance = picture(mean), picture(difference**2 / (1 - first**2) * (1 + 4 / (count - 1)))
+    for radius in RADII:
+        sums, counts = windows(np.concatenate([left, variance], axis=-1), radius)
+        means = sums[..., :3] / counts[..., None]
+        square = (means @ LUMINANCE) ** 2
+        noise = 2 * sums[..., 3] / counts**2
+        back = (np.maximum(square - noise, 0) / np.maximum(square, 1e-37))[..., None] * means
+        left, image = left - back, image + back
+    # At the edges of the picture a neighbour that is missing is the pixel at the edge, once more.
+    both = np.stack([(left @ LUMINANCE) ** 2, variance[..., 0]], axis=-1)
+    padded = np.pad(both, [(1, 1), (1, 1), (0, 0)], mode="edge")
+    near = sum(padded[y : y + height, x : x + width] for y in range(3) for x in range(3))
+    part = np.maximum(near[..., 0] - 2 * near[..., 1], 0) / np.maximum(near[..., 0], 1e-37)
+    return image + part[..., None] * left
+
+
+def error(image, truth):
+    return float(((image - truth) ** 2).mean())
+
+
+def test_filter_that_stays_as_it_is_leaves_nothing_to_restore():
+    plan = make_plan(room(), Settings(**FILTER))
+    assert plan.features["RESTORE"].value == 0
+    assert not {"film_lost", "restored"} & {buffer.name for buffer in plan.buffers}
+    assert make_plan(room(), Settings(**RESTORE)).features["RESTORE"].value == 1
+    assert make_plan(room(), Settings(filter_restore=True)).features["RESTORE"].value == 0
+    assert preset_values("psf")["filter_restore"] is True
+
+
+def test_the_picture_equals_a_model_in_numpy(lane_device):
+    opened = renderer(lane_device, room(SIZE), **RESTORE, cell_size=16.0)
+    opened.render(spp=12)
+    image, expected = opened.image().rgb, model(opened)
+    film = opened.device.read(opened.buffers["film"])
+    opened.close()
+    averages = np.zeros((SIZE[0] * SIZE[1], 3))
+    averages[opened.order] = film["sum"] / film["count"][:, None]
+    assert error(expected, averages.reshape(image.shape)) > 1e-6
+    np.testing.assert_allclose(image, expected, rtol=1e-3, atol=1e-4)
+
+
+def test_with_ever_more_samples_nothing_of_the_blur_is_left(device):
+    """Cells as large as the room: averages alone stay wrong, and the rest goes back.
+
+    Bias of up to twice the variance hides in noise: three times the error of path tracing.
+    """
+    truth = render(device, room(SIZE), 1024, seed=7).rgb
+    settings = {**RESTORE, "cell_size": 1000.0}
+    plain = {spp: error(render(device, room(SIZE), spp).rgb, truth) for spp in (4, 256)}
+    blurred = render(device, room(SIZE), 256, (), **(settings | {"filter_restore": False})).rgb
+    opened = renderer(device, room(SIZE), **settings)
+    errors = {}
+    for spp in (4, 256):
+        opened.render(spp=spp)
+        errors[spp] = error(opened.image().rgb, truth)
+    opened.close()
+    assert error(blurred, truth) > 20 * plain[256]
+    assert errors[256] < 3 * plain[256]
+    assert errors[4] < plain[4]
+
+
+@pytest.mark.parametrize("slots", [128, 1024])
+def test_same_bits_for_any_pool_with_what_is_restored(device, slots):
+    truth = render(device, room(SIZE), 9, **RESTORE)
+    small = open_device(traits=replace(device.traits, slots=slots))
+    assert render(small, room(SIZE), 9, **RESTORE).rgb.tobytes() == truth.rgb.tobytes()
+
+
+def test_one_sample_is_not_judged(device):
+    """Nothing is known of the noise of one: the averages are the picture."""
+    settings = RESTORE | {"filter_restore": False}
+    np.testing.assert_allclose(
+        render(device, room(SIZE), 1, **RESTORE).rgb,
+        render(device, room(SIZE), 1, **settings).rgb,
+        rtol=1e-6,
+    )
