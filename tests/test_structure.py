@@ -139,6 +139,13 @@ def test_setup_lists_every_package_and_dependency():
         assert name in imported and name in config["options.extras_require"][extra]
 
 
+@pytest.mark.parametrize("path", sorted(kernel_folder().glob("*.cl")), ids=lambda path: path.name)
+def test_a_stage_that_looks_up_hits_knows_of_places(path):
+    """Built without them it would take the tree over the places for one of triangles."""
+    if re.search(r"\b(surface_point|closest_hits|blocked_rays)\(", path.read_text()):
+        assert '"INSTANCES"' in (ROOT / "psf_cl" / "stages" / f"{path.stem}.py").read_text()
+
+
 @pytest.mark.parametrize("path", KERNEL_FILES, ids=lambda path: path.name)
 def test_inline_functions_are_static(path):
     """Else OpenCL C emits none of them, and a call that is not inlined has nothing to call."""
