@@ -556,8 +556,11 @@ class Renderer:
             Whether it is written.
 
         Raises:
-            InputError: the file cannot be written; an older one stays as it was.
+            InputError: the file cannot be written; an older one stays as it was.  Or this is no
+                longer the first frame: what is kept between frames is in no checkpoint.
         """
+        if self.scheduler.first:
+            raise InputError(f"{path}: a checkpoint is of one image, not of a later frame")
         if not self.scheduler.at_rest:
             self.scheduler.rest()
             return False
@@ -732,6 +735,9 @@ class Renderer:
         self._release()
 
     def _release(self) -> None:
+        if self.refit is not None:
+            self.refit.release()
+            self.refit = None
         self.device.release(*self.buffers.values())
         self.buffers.clear()
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from gltf_truth import Glb
 from scene_builder import build, camera, floor, glowing, lambertian
+from test_gltf import Builder
 
 from psf_cl import tables
 from psf_cl.errors import InputError
@@ -277,6 +278,24 @@ def test_sequences_have_the_same_bits_again(device):
     assert (one[2] != one[3]).any()
 
 
+def test_frames_take_no_memory_and_trees_that_are_built_anew_give_back_the_old(device, monkeypatch):
+    scene = bending(with_tree=True)
+    renderer = frame_renderer(device, scene)
+    taken = []
+    for time, most in ((0.2, np.inf), (0.4, np.inf), (0.6, 0.0), (0.6, 0.0), (0.7, np.inf)):
+        monkeypatch.setattr("psf_cl.renderer.REBUILD_RATIO", most)
+        renderer.set_frame(time)
+        taken.append(device.allocated_bytes - renderer.bvh.nodes.bytes - renderer.bvh.blocks.bytes)
+    # The refit has two words a node.
+    assert max(taken) - min(taken) < 1024
+    assert renderer.stats()["bvh"]["rebuilds"] == 1, "at the second 0.6 s nothing had moved"
+    fresh = frame_renderer(device, baked(scene, 0.7))
+    same = np.abs(means(renderer, 16).rgb - means(fresh, 16).rgb).max(axis=2) < 1e-5
+    assert same.mean() > 0.8
+    renderer.close()
+    fresh.close()
+
+
 def test_frames_of_a_still_scene_add_up_to_one_long_render(device):
     still = baked(bending(), 0.4)
     renderer, long = frame_renderer(device, still), frame_renderer(device, still)
@@ -412,6 +431,73 @@ def test_example_scenes_move_and_say_what_for(path):
     assert scene.notes == ()
     early, late = (load_scene(path, time=time) for time in (0.0, 0.6))
     assert scene_digest(early) != scene_digest(late)
+
+
+# glTF
+
+
+def animated(builder, **changes):
+    """Add a triangle with two morph targets that an animation moves; ``changes`` go into its parts.
+
+    Keys are ``sampler``, ``channel``, ``target``, ``times``, ``values`` and ``node``.
+    """
+    deltas = [{"POSITION": builder.accessor(np.ones((3, 3)))} for _ in range(2)]
+    mesh = builder.mesh(targets=deltas)
+    builder.node(mesh=mesh, **changes.get("node", {}))
+    path = changes.get("target", {}).get("path", "translation")
+    width = {"rotation": 4, "weights": 1}.get(path, 3)
+    times, values = changes.get("times", [0, 1]), changes.get("values", np.ones((2, width)))
+    sampler = {"input": builder.accessor(times), "output": builder.accessor(values)}
+    channel = {"sampler": 0, "target": {"node": 0, "path": path} | changes.get("target", {})}
+    builder.add(
+        "animations",
+        name="move",
+        samplers=[sampler | changes.get("sampler", {})],
+        channels=[channel | changes.get("channel", {})],
+    )
+    return builder
+
+
+MISTAKES = [
+    ({"sampler": {"interpolation": "SMOOTH"}}, "samplers[0].interpolation: expected one of STEP"),
+    ({"sampler": {"input": 99}}, "samplers[0].input: expected an index of accessors"),
+    ({"channel": {"sampler": 1}}, "channels[0].sampler: expected an index of samplers"),
+    ({"target": {"path": "color"}}, "target.path: expected one of translation"),
+    ({"target": {"node": 7}}, "target.node: expected an index of nodes"),
+    ({"times": [1, 1]}, "samplers[0].input: expected an accessor of finite times that grow"),
+    ({"times": [0, np.nan]}, "samplers[0].input: expected an accessor of finite times that grow"),
+    ({"values": np.ones((3, 3))}, "samplers[0].output: expected an accessor of 2 elements"),
+    ({"values": [[1, 2, np.inf], [0, 0, 0]]}, "samplers[0].output: expected an accessor of finite"),
+    ({"sampler": {"interpolation": "CUBICSPLINE"}}, "expected an accessor of 6 elements"),
+    ({"target": {"path": "weights"}}, "samplers[0].output: expected an accessor of 4 elements"),
+    (
+        {"target": {"path": "rotation"}, "values": np.zeros((2, 4))},
+        "samplers[0].output: expected an accessor of quaternions that are not zero",
+    ),
+    ({"node": {"matrix": np.eye(4).ravel().tolist()}}, "expected a node without a matrix"),
+    ({"node": {"weights": [1]}}, "nodes[0].weights: expected 2 numbers"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), MISTAKES, ids=[text for _, text in MISTAKES])
+def test_a_mistake_in_an_animation_is_told_in_one_line(tmp_path, changes, message):
+    (tmp_path / "a.glb").write_bytes(animated(Builder(), **changes).glb())
+    with pytest.raises(InputError) as caught:
+        posed(load_scene(tmp_path / "a.glb", moving=True), 0.5)
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_clips_are_picked_by_name_or_number(tmp_path):
+    builder = animated(Builder(), values=[[0, 0, 0], [1, 0, 0]])
+    second = {"input": 3, "output": builder.accessor([[0, 0, 0], [0, 5, 0]])}
+    channel = {"sampler": 0, "target": {"node": 0, "path": "translation"}}
+    builder.add("animations", name="jump", samplers=[second], channels=[channel])
+    (tmp_path / "a.glb").write_bytes(builder.glb())
+    for clip, place in ((None, [1, 0, 0]), ("jump", [0, 5, 0]), ("1", [0, 5, 0])):
+        scene = load_scene(tmp_path / "a.glb", time=9.0, clip=clip)
+        np.testing.assert_array_equal(scene.shapes[0].transform[:3, 3], place)
+    with pytest.raises(InputError, match="no animation 'walk'; known: 'move', 'jump'"):
+        load_scene(tmp_path / "a.glb", time=9.0, clip="walk")
 
 
 # Files
