@@ -1,0 +1,236 @@
+"""Render at random until told to stop: ``python tools/soak.py --seconds 7200 [--state FILE]``.
+
+Each round takes a random scene, preset, settings that go with it, size and budget, and renders it
+as a user would, in a process of its own: once without a stop; and once more, stopped again and
+again by kill -9, SIGTERM or SIGINT, or left alone, and resumed from its checkpoint.  A round fails
+if a process ends in a traceback or by a signal that nobody sent, a pixel is not finite, the two
+images differ in a bit, or something is left in the folder.  The round of a seed is always the same;
+``--state`` keeps the next seed and the sums, so that a soak goes on in parts.
+
+The memory of long renders is watched too: of one process that renders scene after scene.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from psf_cl.cli.common import positive_number
+from psf_cl.errors import InputError
+from psf_cl.files import write_whole
+from psf_cl.image import read_exr
+from psf_cl.plan import make_plan
+from psf_cl.scene.load import load_scene
+from psf_cl.settings import PRESETS, Settings, resolve
+
+ROOT = Path(__file__).resolve().parent.parent
+SCENES = tuple(sorted(path.name for path in (ROOT / "scenes").glob("*.toml")))
+
+#: A part of a render that was not stopped has to end after so many seconds.
+MOST_SECONDS = 900.0
+
+#: Numbers that a round may set a setting to: ends of ranges take too long for many rounds.
+LARGEST = 64.0
+
+#: Growth of the memory of a process that renders scene after scene, beyond its first scenes.
+MOST_GROWTH = 64 << 20
+
+
+@dataclass(frozen=True)
+class Round:
+    """What a seed stands for."""
+
+    scene: str
+    preset: str
+    settings: tuple[tuple[str, Any], ...]
+    size: tuple[int, int]
+    spp: int
+    memory: int | None
+    stops: tuple[tuple[str, float], ...]
+
+    def arguments(self) -> list[str]:
+        """Return what ``psf-cl render`` is told in any case."""
+        width, height = self.size
+        sets = [f"{key}={value}" for key, value in self.settings]
+        memory = ["--memory", str(self.memory)] if self.memory else []
+        return [
+            *(f"scenes/{self.scene}", "--preset", self.preset, "--quiet", *memory),
+            *("--size", f"{width}x{height}", "--spp", str(self.spp)),
+            *(["--set", *sets] if sets else []),
+        ]
+
+
+def round_of(seed: int) -> Round:
+    """Return the round of a seed."""
+    chance = random.Random(seed)
+    scene, preset = chance.choice(SCENES), chance.choice(list(PRESETS))
+    settings = _settings(scene, preset, chance)
+    pixels = 2 ** chance.uniform(0, 13)
+    width = max(round(pixels ** chance.uniform(0.2, 0.8)), 1)
+    stops = tuple(
+        (chance.choice(["KILL", "TERM", "INT"]), chance.expovariate(1.0))
+        for _ in range(chance.randrange(4))
+    )
+    return Round(
+        scene,
+        preset,
+        settings,
+        (width, max(round(pixels / width), 1)),
+        max(round(2 ** chance.uniform(0, 9)), 1),
+        chance.choice([None, None, 64, 512]),
+        stops,
+    )
+
+
+def _settings(scene: str, preset: str, chance: random.Random) -> tuple[tuple[str, Any], ...]:
+    """Return some settings that the scene and the preset go with."""
+    chosen: dict[str, Any] = {}
+    loaded = load_scene(ROOT / "scenes" / scene, size=(4, 4))
+    for item in chance.sample(fields(Settings), chance.randrange(5)):
+        meta = item.metadata
+        if "choices" in meta:
+            value: Any = chance.choice(meta["choices"])
+        elif meta.get("switch"):
+            value = chance.random() < 0.5
+        else:
+            low, high = meta["range"]
+            value = type(item.default)(chance.uniform(low, min(high, max(LARGEST, low))))
+        with contextlib.suppress(InputError):
+            both = chosen | {item.name: value}
+            make_plan(loaded, resolve(loaded.render, scene, preset, both))
+            chosen = both
+    return tuple(chosen.items())
+
+
+def run_round(now: Round, folder: Path) -> str:
+    """Run a round; return what went wrong, empty if nothing did."""
+    whole, stopped, state = folder / "whole.exr", folder / "stopped.exr", folder / "state"
+    code, text = _render([*now.arguments(), "-o", str(whole)])
+    if code == 1 and now.memory and "MiB" in text and "Traceback" not in text:
+        return ""  # Refused, with the reason: there is too little memory for it.
+    if code != 0:
+        return f"code {code}: {text}"
+    again = [*now.arguments(), "-o", str(stopped), "--checkpoint", str(state)]
+    again += ["--checkpoint-seconds", "0.05"]
+    for name, seconds in now.stops:
+        resume = ["--resume", str(state)] if state.exists() else []
+        code, text = _render([*again, *resume], name, seconds)
+        # Too early for a sample, or at an end that it came to first.
+        if code not in (0, 130, -signal.SIGKILL) or "Traceback" in text:
+            return f"stopped by {name}: code {code}: {text}"
+    resume = ["--resume", str(state)] if state.exists() else []
+    code, text = _render([*again, *resume])
+    if code != 0:
+        return f"the last part: code {code}: {text}"
+    one, other = read_exr(whole), read_exr(stopped)
+    if not np.isfinite(one.rgb).all():
+        return "a pixel is not finite"
+    if one.rgb.tobytes() != other.rgb.tobytes():
+        return "the resumed image is another one"
+    left = sorted(path.name for path in folder.iterdir() if path.name.startswith(".psf_cl"))
+    # A part of an image that was being written when the process was killed stays until the next
+    # render to that name.
+    if left:
+        return f"left behind: {', '.join(left)}"
+    return ""
+
+
+def _render(arguments: list[str], stop: str = "", seconds: float = MOST_SECONDS) -> tuple[int, str]:
+    """Run ``psf-cl render``; return its code and what it said to standard error."""
+    command = [sys.executable, "-m", "psf_cl", "render", *arguments]
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            _, text = process.communicate(timeout=seconds + 2.0 if stop else seconds)
+        except subprocess.TimeoutExpired:
+            if not stop:
+                process.kill()
+                return 1, f"not done after {seconds:.0f} s"
+            process.send_signal(getattr(signal, f"SIG{stop}"))
+            _, text = process.communicate(timeout=MOST_SECONDS)
+    return process.returncode, text.strip()
+
+
+def memory_growth(count: int) -> int:
+    """Return how much a process grows that renders ``count`` pictures one after another, bytes."""
+    from psf_cl.device.device import open_device
+    from psf_cl.renderer import Renderer
+
+    device, sizes = open_device(), []
+    for number in range(count):
+        preset = list(PRESETS)[number % len(PRESETS)]
+        scene = load_scene(ROOT / "scenes" / "cornell_box.toml", size=(64, 64))
+        with contextlib.closing(
+            Renderer(scene, resolve({}, scene.path, preset), device)
+        ) as renderer:
+            renderer.render(spp=16)
+            renderer.image()
+        sizes.append(_resident())
+    assert device.allocated_bytes == 0, "device memory is left"
+    # Presets compile their programs once.
+    return sizes[-1] - sizes[min(2 * len(PRESETS), count - 1)]
+
+
+def _resident() -> int:
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss << 10
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Soak; return 1 if anything failed so far, those of earlier parts too."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--seconds", type=positive_number, default=600.0, help="of this part")
+    parser.add_argument("--seed", type=int, help="the first round; default: where --state ended")
+    parser.add_argument("--state", type=Path, help="file that keeps the sums")
+    parser.add_argument("--count", type=int, default=1 << 60, help="rounds at most")
+    parser.add_argument("--pictures", type=int, default=24, help="of the watch on memory")
+    args = parser.parse_args(argv)
+    sums = {"next_seed": 0, "rounds": 0, "stops": 0, "seconds": 0.0, "failures": []}
+    if args.state is not None and args.state.exists():
+        sums |= json.loads(args.state.read_text())
+    if args.seed is not None:
+        sums["next_seed"] = args.seed
+    begin = last = time.monotonic()
+    done = 0
+    while time.monotonic() - begin < args.seconds and done < args.count:
+        now, done = round_of(sums["next_seed"]), done + 1
+        with tempfile.TemporaryDirectory() as folder:
+            failure = run_round(now, Path(folder))
+        if failure:
+            sums["failures"].append(f"seed {sums['next_seed']}: {now}: {failure}")
+            print(sums["failures"][-1], flush=True)
+        sums["next_seed"] += 1
+        sums["rounds"] += 1
+        sums["stops"] += len(now.stops)
+        sums["seconds"] += time.monotonic() - last
+        last = time.monotonic()
+        if args.state is not None:
+            write_whole(args.state, json.dumps(sums, indent=2).encode())
+    growth = memory_growth(args.pictures) if args.pictures else 0
+    flat = growth < MOST_GROWTH
+    print(
+        f"{sums['rounds']} rounds, {sums['stops']} stops, {sums['seconds']:.0f} s: "
+        f"{len(sums['failures'])} failures; memory grew by {growth / 2**20:.1f} MiB"
+    )
+    return int(bool(sums["failures"]) or not flat)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
