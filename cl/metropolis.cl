@@ -11,8 +11,6 @@
 #include "common/rng.h"
 #include "common/splat.h"
 
-static inline Float luminance(Vec3 v) { return 0.2126f * v.x + 0.7152f * v.y + 0.0722f * v.z; }
-
 /// Let finished mutations bring their light to the film; return which chains move to them.
 ///
 /// Proposal and state both count, each with its chance; large steps count also as the independent samples
