@@ -953,7 +953,7 @@ class Renderer:
                 -(-traits.slots // kernel.paths_per_item(traits)),
             )
             for stage in self.plan.stages
-            if not (stage.per_pass or stage.between_passes or stage.per_frame)
+            if not (stage.per_pass or stage.per_frame)
             for kernel in stage.kernels
         ]
         self._bind_cells(programs.get("cells"))

@@ -83,5 +83,6 @@ def plan(context: Context) -> StageSpec | None:
         flags=("GUIDE",),
         kernels=(kernel,),
         buffers=buffers,
+        per_pass=True,
         between_passes=True,
     )
