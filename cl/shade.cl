@@ -347,7 +347,7 @@ kernel void shade_paths(
 #if GUIDE
     const UInt noise = mix_bits(mix_bits(get_u(path, PATH_SEED) + depth * 0x9e3779b9u) + sample);
     const Mask learning = alive & (sample < counters[COUNTER_LEARN_LIMIT]);
-    const Guide guide = find_guide(params, guide_keys, guide_cells, guide_full, counters, goes_on, any_lane(learning),
+    const Guide guide = find_guide(params, guide_keys, guide_cells, guide_full, counters, goes_on, learning,
                                    guide_cell_of(params, s.p, s.ns, noise));
     // What the last ray brought: what this surface emits, and reflects of what its own cell knows of.  What
     // it reflects of a light that a shadow ray finds is added when that is known.

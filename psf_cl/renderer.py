@@ -546,6 +546,11 @@ class Renderer:
             launch(items, film.GROUP)
         return self._in_rows(self.device.read(self.buffers["restored"]).reshape(-1, 4)[:, :3])
 
+    def settle(self) -> None:
+        """Finish the passes that have begun, so that ``save`` can write a checkpoint."""
+        if not self.scheduler.at_rest:
+            self.scheduler.run(self.scheduler.begun, None)
+
     def save(self, path: str | os.PathLike[str]) -> bool:
         """Write a checkpoint, if this is a moment for one.
 
@@ -688,7 +693,8 @@ class Renderer:
         self, counters: np.ndarray, rays: dict[str, int]
     ) -> dict[str, float | None]:
         """Return how long paths are, and which part of them brings no light at all."""
-        pending = int(counters[layout.COUNTER_INDEX["film_pass"]]) == 0
+        # Chains have no samples that could be dark.
+        pending = self.scheduler.passes == 0 or self.chains is not None
         paths = max(rays["camera"], 1)
         dark = layout.whole(counters, "dark_samples")
         return {

@@ -134,6 +134,11 @@ class Scheduler:
         """
         return self.epoch_end is None or self.passes >= self.stop
 
+    @property
+    def begun(self) -> int:
+        """Return how many passes have begun, those included that have ended."""
+        return min(self.started, self.stop)
+
     def rest(self) -> None:
         """Start no further pass until ``at_rest`` was seen once: a moment to save everything.
 
@@ -193,7 +198,9 @@ class Scheduler:
                     self._rest(limit)
                 if seconds is not None and now >= seconds:
                     # The pass in which the budget ends is finished; later ones are not begun.
-                    limit, seconds = min(self.passes + 1, MAX_PASSES), None
+                    # Where tables change with every pass, what has begun of an epoch is finished.
+                    begun = 0 if self.epoch_end is None else self.begun
+                    limit, seconds = min(max(self.passes + 1, begun), MAX_PASSES), None
                     self._start(limit)
                 elif self.passes == self.epoch.stop < limit:
                     self._start(limit)

@@ -134,7 +134,7 @@ typedef struct {
     Float mean;    // what a white diffuse surface reflects there of what no shadow ray finds, as far as known
 } Guide;
 
-/// Find the cells of these points; with `learns` they are made.
+/// Find the cells of these points; those of the lanes of `learning` are made.
 ///
 /// A full bucket is marked and counted: its cells are given up before the next epoch.
 static inline Guide find_guide(
@@ -144,7 +144,7 @@ static inline Guide find_guide(
     __global uint *full,
     volatile __global uint *counters,
     Mask wanted,
-    int learns,
+    Mask learning,
     CellKey key)
 {
     const uint size = bucket_size(params->guide_slots);
@@ -159,12 +159,15 @@ static inline Guide find_guide(
         store_lanes_u(key.bucket, lane_bucket);
         store_lanes_u(key.key, lane_key);
         store_lanes_u(g.slot, lane_slot);
+        const uint learns = lane_bits(learning);
         uint failed = 0;
         for (uint left = lane_bits(absent); left; left &= left - 1u) {
             const uint k = lowest_bit(left);
-            lane_slot[k] = learns ? find_or_insert(keys, lane_bucket[k], size, lane_key[k])
-                                  : find((const __global uint *)keys, lane_bucket[k], size, lane_key[k]);
-            if (learns && lane_slot[k] == NO_SLOT) {
+            // Whether a lane inserts must not hang on its neighbours, which are others for another pool.
+            const uint inserts = (learns >> k) & 1u;
+            lane_slot[k] = inserts ? find_or_insert(keys, lane_bucket[k], size, lane_key[k])
+                                   : find((const __global uint *)keys, lane_bucket[k], size, lane_key[k]);
+            if (inserts && lane_slot[k] == NO_SLOT) {
                 full[lane_bucket[k] / size] = 1u;
                 ++failed;
             }

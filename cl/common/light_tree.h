@@ -112,7 +112,10 @@ LARGE_FUNCTION LightChoice choose_in_tree(
         u = clamp(rest, (Float)(0.0f), (Float)(0x1.fffffep-1f));
         const UInt child = pick_u(left, GATHER_U(pairs, pair, child[0]), GATHER_U(pairs, pair, child[1]));
         const Mask leaf = child >= LEAF_BIT;
-        choice.light = pick_u(inner & leaf, child & ~LEAF_BIT, choice.light);
+        // Where no light was fit for the tree, its only pair leads nowhere.
+        const Mask there = child != NO_LIGHT;
+        choice.light = pick_u(inner & leaf & there, child & ~LEAF_BIT, choice.light);
+        choice.pmf = pick(inner & !there, (Float)(0.0f), choice.pmf);
         inner &= !leaf;
         pair = pick_u(inner, child, (UInt)(0u));
     }

@@ -235,6 +235,8 @@ def _render_frame(
         else:
             spp = None if args.seconds else args.spp or DEFAULT_SPP
             renderer.render(spp=spp, seconds=args.seconds, progress=on_progress)
+    if args.checkpoint:
+        renderer.settle()
     image = renderer.image()
     stats = image.stats
     checkpoints.save(stats["spp"])

@@ -355,10 +355,10 @@ def _coverage(pixels: np.ndarray) -> np.ndarray:
 
 
 def _with_alpha(base: np.ndarray | None, alpha: np.ndarray) -> np.ndarray:
-    """Return ``base``, or white, with another alpha, in the size of the larger one."""
+    """Return ``base``, or white, with another alpha, as fine along each axis as the finer one."""
     if base is None:
         base = np.full((1, 1, 4), 255, np.uint8)
-    height, width = max(base.shape[:2], alpha.shape)
+    height, width = (int(n) for n in np.maximum(base.shape[:2], alpha.shape))
     pixels = _stretched(base, height, width)
     pixels[..., 3] = _stretched(alpha, height, width)
     return pixels

@@ -46,11 +46,11 @@ def convert_pictures(
 
     Args:
         diffuse, specular: ``(h, w, 4)`` uint8; colours are sRGB, alpha is opacity and glossiness.
-            They may differ in size: the results have that of the larger one.
+            They may differ in size: the results are as fine along each axis as the finer one.
         diffuse_factor: ``(3,)``, linear; the opacity's is left to the material.
         factors: ``(4,)``, of the specular colour and the glossiness.
     """
-    height, width = max(diffuse.shape[:2], specular.shape[:2])
+    height, width = (int(n) for n in np.maximum(diffuse.shape[:2], specular.shape[:2]))
     base = np.empty((height, width, 4), np.uint8)
     rough = np.full((height, width, 4), 255, np.uint8)
     for top in range(0, height, _ROWS):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from psf_cl.device import layout
 from psf_cl.device.hash_map import SUM_BITS, buckets_of, fixed_point, slots_for
 from psf_cl.scene.model import Scene
 from psf_cl.settings import Settings
-from psf_cl.stages.cells import HEADROOM, brightest
+from psf_cl.stages.cells import HEADROOM, brightest, pixel_per_meter
 from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
 
 #: Slots of the table: a slot for so many pixels, within these bounds (a slot takes 1092 bytes).
@@ -41,12 +40,10 @@ def parameters(
     scene: Scene, settings: Settings, pixel_count: int, scene_radius: float
 ) -> dict[str, Any]:
     """Return what the kernels need to know, by the names of ``layout.PARAMS``."""
-    camera = scene.cameras[scene.camera]
-    pixel = 2.0 * math.tan(camera.fov_y / 2.0) / scene.height
     steps = fixed_point(HEADROOM * brightest(scene), MOST_VISITS)
     return {
         "guide_slots": slots_of(pixel_count),
-        "guide_width": settings.guide_cell_size * pixel,
+        "guide_width": settings.guide_cell_size * pixel_per_meter(scene),
         "guide_least": LEAST_EDGE * scene_radius,
         "guide_most": MOST_EDGE * scene_radius,
         "guide_share": settings.guide_share,
