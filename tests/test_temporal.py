@@ -12,6 +12,7 @@ from psf_cl.device.device import open_device
 from psf_cl.plan import make_plan
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.curve import Curve
+from psf_cl.scene.load import load_scene
 from psf_cl.settings import Settings
 
 OUTPUTS = ("history", "alpha", "motion", "gradient")
@@ -249,6 +250,105 @@ def test_adaptive_is_ahead_of_both_other_rules_when_a_light_changes(device, fact
     assert errors["adaptive"][at + 3] < 1.1 * fresh[3]
     assert errors["adaptive"][at + 7] < 1.1 * fresh[7]
     assert sum(errors["adaptive"]) < min(sum(errors["cumulative"]), sum(errors["exponential"]))
+
+
+SCENE = """
+[film]
+width = {size[0]}
+height = {size[1]}
+[camera]
+position = {eye}
+target = {target}
+fov_y = 40
+[environment]
+radiance = [0.2, 0.2, 0.2]
+[materials.floor]
+base_color = [0.7, 0.5, 0.3]
+specular = 0
+[materials.thing]
+base_color = [0.3, 0.6, 0.8]
+specular = 0
+[materials.lamp]
+specular = 0
+emission = [8, 6, 4]
+[[shapes]]
+primitive = "quad"
+material = "floor"
+transform = [{{ scale = 3 }}]
+[[shapes]]
+name = "thing"
+primitive = "{thing}"
+material = "thing"
+transform = [{{ scale = {scale} }}, {turned}{{ translate = {start} }}]
+[[shapes]]
+name = "lamp"
+primitive = "quad"
+material = "lamp"
+transform = [{{ scale = 0.3 }}, {{ rotate = [180, 0, 0] }}, {{ translate = [0.3, 2, 0] }}]
+[[animation]]
+target = "{target_name}"
+property = "translation"
+times = [0.0, 1.0]
+values = [[0, 0, 0], {way}]
+"""
+
+
+def moving(tmp_path, target_name, way, **values):
+    """Return a thing on a floor and a lamp above, one of which moves ``way`` in 24 frames."""
+    values = {
+        "size": (120, 90),
+        "eye": [0, 1.2, 3],
+        "target": [0, 0.5, 0],
+        "thing": "sphere",
+        "scale": 0.4,
+        "turned": "",
+        "start": [-0.8, 0.4, 0.3],
+    } | values
+    path = tmp_path / "moving.toml"
+    path.write_text(
+        SCENE.format(target_name=target_name, way=[float(part) for part in way], **values)
+    )
+    return load_scene(path, moving=True)
+
+
+def test_history_goes_along_with_what_moves(device, tmp_path):
+    """A board that hides all else moves by two pixels a frame: its whole history moves with it."""
+    size, distance = (32, 24), 2.0
+    footprint = distance * 2 * np.tan(np.radians(20)) / size[1]
+    scene = moving(
+        tmp_path,
+        "thing",
+        (24 * 2 * footprint, 0, 0),
+        size=size,
+        eye=[0, 5, distance],
+        target=[0, 5, 0],
+        thing="quad",
+        scale=50,
+        turned="{ rotate = [90, 0, 0] }, ",
+        start=[0, 5, 0],
+    )
+    images = sequence(device, scene, 4, temporal="cumulative")
+    np.testing.assert_allclose(images[3].aovs["motion"][..., 0], 2.0, atol=1e-3)
+    np.testing.assert_allclose(images[3].aovs["motion"][..., 1], 0.0, atol=1e-3)
+    history = np.broadcast_to(np.minimum(np.arange(32) // 2 + 1, 4), (24, 32))
+    np.testing.assert_allclose(images[3].aovs["history"][..., 0], history, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_adaptive_is_ahead_of_both_other_rules_while_something_moves(device, tmp_path):
+    """A ball and its shadow go across the floor."""
+    scene = moving(tmp_path, "thing", (1.6, 0.0, 0.0))
+    frames = 20
+    truth = [image.rgb for image in sequence(device, scene, frames, spp=128, outputs=())]
+    errors = {}
+    for rule in ("off", "adaptive", "cumulative", "exponential"):
+        images = sequence(device, scene, frames, outputs=(), temporal=rule)
+        errors[rule] = sum(
+            np.mean((image.rgb - expected) ** 2 / (expected**2 + 0.01))
+            for image, expected in zip(images, truth, strict=True)
+        )
+    assert errors["adaptive"] < 0.5 * errors["off"]
+    assert errors["adaptive"] < min(errors["cumulative"], errors["exponential"])
 
 
 @pytest.mark.slow
