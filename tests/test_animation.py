@@ -416,6 +416,13 @@ def test_without_time_a_scene_is_as_if_it_had_no_animation(tmp_path):
         np.testing.assert_array_equal(one.transform, other.transform)
 
 
+def test_a_sequence_of_a_scene_without_animation_is_told_so(tmp_path):
+    path = tmp_path / "a.toml"
+    path.write_text(SCENE.split("[[animation]]")[0])
+    scene = load_scene(path, moving=True)
+    assert scene.nodes == () and "every frame shows the same" in scene.notes[-1]
+
+
 def test_a_camera_that_looks_at_itself_is_told_with_the_time(tmp_path):
     path = tmp_path / "a.toml"
     path.write_text(SCENE.replace("[1, 0, 0]]\ninterpolation", "[0, 1, 5]]\ninterpolation"))

@@ -10,7 +10,7 @@ import numpy as np
 
 from psf_cl.errors import InputError
 from psf_cl.scene import mesh, transform
-from psf_cl.scene.animation import baked, settled
+from psf_cl.scene.animation import baked, is_animated, settled
 from psf_cl.scene.environment import load_environment
 from psf_cl.scene.gltf import load_gltf
 from psf_cl.scene.model import (
@@ -84,6 +84,9 @@ def load_scene(
             files=(*scene.files, str(environment)),
         )
     scene = _with_light(_with_camera(_with_size(scene, size), camera, time))
+    if moving and not is_animated(scene):
+        note = "nothing in the scene is animated: every frame shows the same"
+        scene = replace(scene, notes=(*scene.notes, note))
     scene = settled(scene) if moving else baked(scene, time)
     return _without_unused(scene)
 
