@@ -324,6 +324,27 @@ def test_a_slit_under_a_plate_stays_dark(device):
     assert bias[False] > 0.03 and abs(bias[True]) < 0.25 * bias[False], bias
 
 
+def test_a_lit_plane_is_flat_across_levels(device):
+    """A floor that runs away from the camera, under a sky of 1: its albedo, whatever the level."""
+    scene = build(
+        [floor(200.0, lambertian((0.2, 0.5, 0.8)))],
+        camera((0, 2, 150), (0, 0, 140), 40),
+        (48, 64),
+        environment=1.0,
+    )
+    # Independent samples of the sky by shadow rays: noise that is known to be the same everywhere.
+    settings = {"direct_sampling": "light", "sampler": "random"}
+    shared = {**FILTER, "filter_vertex": "1", "cell_shrink": False, "cell_size": 8.0}
+    albedo = np.array((0.2, 0.5, 0.8))
+    plain = render(device, scene, 4, **settings).rgb[24:].mean(axis=1) / albedo
+    image = render(device, scene, 4, **settings, **shared).rgb[24:] / albedo
+    rows = image.mean(axis=(1, 2))
+    noise = plain[:, 0].std()
+    # Distances along the floor grow by 8: three levels.  Each row is as bright as it should be.
+    np.testing.assert_allclose(rows, 1.0, atol=6 * noise)
+    assert 0 < image.std() < plain.std() * np.sqrt(48)
+
+
 @pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "x"])
 def test_cells_without_size_are_refused(value):
     with pytest.raises(InputError, match=r"cell_size must be"):

@@ -230,8 +230,10 @@ from scene_builder import render
 from psf_cl.device.device import open_device
 device = open_device()
 digest = hashlib.sha256()
-for columns in (12, 6):
-    image = render(device, scene(columns=columns), 40, OUTPUTS)
+shared = {"path_filter": "hash_grid", "filter_vertex": "1", "filter_restore": True}
+renders = [(12, OUTPUTS, {}), (6, OUTPUTS, {}), (6, ["variance"], shared)]
+for columns, outputs, settings in renders:
+    image = render(device, scene(columns=columns), 40, outputs, **settings)
     for name in sorted(image.aovs):
         digest.update(image.aovs[name].tobytes())
 print(device.cl_device.max_compute_units, digest.hexdigest())
