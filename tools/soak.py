@@ -66,7 +66,7 @@ class Round:
     def arguments(self) -> list[str]:
         """Return what ``psf-cl render`` is told in any case."""
         width, height = self.size
-        sets = [f"{key}={value}" for key, value in self.settings]
+        sets = [f"{key}={json.dumps(value)}".replace('"', "") for key, value in self.settings]
         memory = ["--memory", str(self.memory)] if self.memory else []
         return [
             *(f"scenes/{self.scene}", "--preset", self.preset, "--quiet", *memory),
@@ -130,8 +130,10 @@ def run_round(now: Round, folder: Path) -> str:
     for name, seconds in now.stops:
         resume = ["--resume", str(state)] if state.exists() else []
         code, text = _render([*again, *resume], name, seconds)
-        # Too early for a sample, or at an end that it came to first.
-        if code not in (0, 130, -signal.SIGKILL) or "Traceback" in text:
+        # Too early even for the program, or at an end that it came to first.
+        if code in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT):
+            continue
+        if code not in (0, 130) or "Traceback" in text:
             return f"stopped by {name}: code {code}: {text}"
     resume = ["--resume", str(state)] if state.exists() else []
     code, text = _render([*again, *resume])
