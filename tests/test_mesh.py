@@ -170,6 +170,12 @@ def test_obj_materials_keep_color_emission_and_texture(tmp_path):
     assert corners(by_name["dark wood"].mesh) == [[[0, 1, 0], [1, 0, 0], [0, 0, 0]]]
 
 
+def test_obj_coordinates_that_are_not_finite_are_0(tmp_path):
+    text = TRIANGLE + "vt nan 0.25\nvt 1e99 0\nf 1/1 2/2 3/1\n"
+    uvs = obj(tmp_path, text).shapes[0].mesh.uvs
+    assert sorted(map(tuple, uvs.tolist())) == [(0.0, 0.75), (0.0, 0.75), (0.0, 1.0)]
+
+
 @pytest.mark.filterwarnings("error")
 def test_obj_normals_beyond_float_are_none(tmp_path):
     text = TRIANGLE + "vn 1e200 0 0\nf 1//1 2//1 3//1\n"

@@ -163,6 +163,7 @@ def _mesh_of(path: Path, name: str, part: dict[str, Any]) -> Mesh | None:
     if uvs is not None:
         # v grows upwards in these formats.
         uvs = np.stack([uvs[:, 0], 1 - uvs[:, 1]], axis=-1)
+        uvs = np.where(np.isfinite(uvs), uvs, np.float32(0.0))
     return Mesh(
         name=name,
         positions=positions,
