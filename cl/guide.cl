@@ -5,7 +5,7 @@
 #include "common/hash_map.h"
 
 // Visits that what is known of the square around is worth.
-#define TRUST 2.0f
+#define TRUST 8.0f
 
 static inline float sum_of(__global const GuideSum *sums, uint k)
 {

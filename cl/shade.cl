@@ -347,8 +347,9 @@ kernel void shade_paths(
 #if GUIDE
     const UInt noise = mix_bits(mix_bits(get_u(path, PATH_SEED) + depth * 0x9e3779b9u) + sample);
     const Mask learning = alive & (sample < counters[COUNTER_LEARN_LIMIT]);
-    const Guide guide = find_guide(params, guide_keys, guide_cells, guide_full, counters, goes_on, learning,
-                                   guide_cell_of(params, s.p, s.ns, noise));
+    const Mask guided = goes_on & (Mask)(counters[COUNTER_GUIDE_OFF] ? 0 : -1);
+    const Guide guide =
+        find_guide(params, guide_keys, guide_cells, guide_full, counters, guided, learning, s.p, s.ns, noise);
     // What the last ray brought: what this surface emits, and reflects of what its own cell knows of.  What
     // it reflects of a light that a shadow ray finds is added when that is known.
     const UInt guide_from = pick_u(learning & !camera_ray, get_u(path, PATH_GUIDE), (UInt)(NO_PART));
@@ -441,7 +442,7 @@ kernel void shade_paths(
         Float pdf;
         const Vec3 f = eval_bsdf(b, chances, wo_local, wi_local, dot3(s.ng, light.wi), &pdf);
 #if GUIDE
-        guide_pdf(guide_cells, guide.known, chances, wi_local GUIDE_TURN, &pdf);
+        guide_pdf(guide_cells, guide.known, chances, 0, wi_local GUIDE_TURN, &pdf);
 #endif
         Float weight = (Float)(1.0f);
         if (params->direct_sampling == DIRECT_MIS)
@@ -483,7 +484,7 @@ kernel void shade_paths(
     Float pdf;
     const Vec3 f = eval_bsdf(b, chances, wo_local, drawn, dot3(s.ng, wi), &pdf);
 #if GUIDE
-    const UInt part = guide_pdf(guide_cells, guide.known, chances, drawn GUIDE_TURN, &pdf);
+    const UInt part = guide_pdf(guide_cells, guide.known, chances, any_lane(guide.slot != NO_SLOT), drawn GUIDE_TURN, &pdf);
     put_u(path, PATH_GUIDE, guide_part(guide, part, u_lobe < chances.diffuse));
 #endif
 #if CELLS == 2

@@ -219,13 +219,7 @@ class Renderer:
     def _between(self, start: int) -> None:
         """Do what the paths of an epoch need that begins with pass ``start``."""
         if self.freeze_guide is not None:
-            first = self.scheduler.first
-            end = first + doubling_epoch(start - first, self.plan.shortest_epoch)
-            epoch = range(start, end)
-            self.freeze_guide.set(fades=int(0 < start <= guide.FADING_PASSES))
-            self.freeze_guide(guide.slots_of(self.plan.pixel_count), film.GROUP)
-            value = np.array([guide.learn_limit(epoch)], np.uint32)
-            self.device.write(self.buffers["counters"], value, layout.COUNTER_INDEX["learn_limit"])
+            self._teach(start)
         if self.chains is not None:
             is_first = start == self.scheduler.first
             self.chains.start() if is_first else self.chains.measure()
@@ -676,15 +670,34 @@ class Renderer:
             "seed": self.settings.seed,
         }
 
+    def _teach(self, start: int) -> None:
+        """Draw the epoch of pass ``start`` by what was learned so far, if that pays."""
+        at = layout.COUNTER_INDEX["guide_off"]
+        left_out = bool(self.device.read(self.buffers["counters"])[at])
+        passes = start - self.scheduler.first
+        if not left_out:
+            # What another frame taught fades too.
+            fades = start > 0 and passes <= guide.FADING_PASSES
+            self.freeze_guide.set(fades=int(fades))
+            self.freeze_guide(guide.slots_of(self.plan.pixel_count), film.GROUP)
+        if not left_out and passes in guide.DECISION_PASSES:
+            cells = self.device.read(self.buffers["guide_cells"])
+            left_out = not guide.is_worth_it(cells, self.settings.guide_share)
+        end = start + doubling_epoch(passes, self.plan.shortest_epoch) - passes
+        limit = 0 if left_out else guide.learn_limit(range(start, end))
+        self.device.write(self.buffers["counters"], np.array([left_out, limit], np.uint32), at)
+
     def _guide_statistics(self, counters: np.ndarray) -> dict[str, int | float] | None:
         if self.freeze_guide is None:
             return None
         keys = self.device.read(self.buffers["guide_keys"])
-        visits = self.device.read(self.buffers["guide_cells"])["visits"]
+        cells = self.device.read(self.buffers["guide_cells"])
         return {
+            "left_out": bool(counters[layout.COUNTER_INDEX["guide_off"]]),
+            "noise_left": guide.noise_left(cells, self.settings.guide_share),
             "cells": int(np.count_nonzero(keys)),
             "load": float(np.count_nonzero(keys)) / len(keys),
-            "taught_cells": int(np.count_nonzero(visits >= layout.CONSTANT["GUIDE_BINS"])),
+            "taught_cells": int(np.count_nonzero(cells["visits"] >= layout.CONSTANT["GUIDE_BINS"])),
             "failed_inserts": int(counters[layout.COUNTER_INDEX["guide_failed"]]),
             "rejected": int(counters[layout.COUNTER_INDEX["guide_rejected"]]),
         }

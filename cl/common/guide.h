@@ -145,10 +145,18 @@ static inline Guide find_guide(
     volatile __global uint *counters,
     Mask wanted,
     Mask learning,
-    CellKey key)
+    Vec3 p,
+    Vec3 n,
+    UInt random)
 {
-    const uint size = bucket_size(params->guide_slots);
     Guide g;
+    g.slot = (UInt)(NO_SLOT);
+    g.known = g.slot;
+    g.mean = (Float)(0.0f);
+    if (!any_lane(wanted))
+        return g;
+    const CellKey key = guide_cell_of(params, p, n, random);
+    const uint size = bucket_size(params->guide_slots);
     g.slot = find_lanes((const __global uint *)keys, full, wanted, key.bucket, size, key.key);
     const Mask absent = wanted & (g.slot == NO_SLOT);
     // A bucket that overflows during an epoch keeps what it knows until its end: whatever came first.

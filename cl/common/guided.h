@@ -21,10 +21,12 @@ typedef struct {
 #endif
 
 /// Replace the cosine density of the diffuse lobe in `pdf` by that of the guide; returns the part of the
-/// hemisphere that `wi` (local) is in.
+/// hemisphere that `wi` (local) is in, if somebody `learns` or is guided.
 static inline UInt guide_pdf(
-    __global const GuideCell *cells, UInt slot, LobeChances chances, Vec3 wi GUIDE_TURN_PARAMETERS, Float *pdf)
+    __global const GuideCell *cells, UInt slot, LobeChances chances, int learns, Vec3 wi GUIDE_TURN_PARAMETERS, Float *pdf)
 {
+    if (!any_lane(slot != NO_SLOT) && !learns)
+        return (UInt)(0u);
 #if TANGENTS
     const UInt part = guide_bin(wi.x * turn.xs + wi.y * turn.ys, wi.x * turn.xt + wi.y * turn.yt);
 #else
@@ -67,11 +69,11 @@ static inline Vec3 sample_guided(
 /// Chance to go on where the guide knows what is still to come; `otherwise` where it does not.
 ///
 /// It sends rays of a small throughput to where the light is: what a path is worth is not what is behind
-/// it.  Paths that bring a third of what their first vertex was expected to, or more, go on.
+/// it.  Paths that bring a fifth of what their first vertex was expected to, or more, go on.
 /// Vorba, Krivanek: Adjoint-Driven Russian Roulette and Splitting, 2016.
 static inline Float informed_chance(Float to_come, Float expected, Float otherwise)
 {
     const Mask known = (to_come > 0.0f) & (expected > 0.0f) & (expected < INFINITY);
-    const Float chance = 3.0f * to_come / pick(known, expected, (Float)(1.0f));
+    const Float chance = 5.0f * to_come / pick(known, expected, (Float)(1.0f));
     return pick(known, clamp(chance, (Float)(0.05f), (Float)(1.0f)), otherwise);
 }

@@ -193,11 +193,12 @@
 #define COUNTER_DARK_SAMPLES_HIGH 24u // high word
 #define COUNTER_GUIDE_FAILED 25u // vertices that found their part of the table of the guide full
 #define COUNTER_GUIDE_REJECTED 26u // what is not finite, or too large for the sums of the guide
-#define COUNTER_LEARN_LIMIT 27u // first pass that the guide learns nothing from; set by the host
-#define COUNTER_PENDING_CAMERA 28u // rays since the last film launch
-#define COUNTER_PENDING_BOUNCE 29u
-#define COUNTER_PENDING_SHADOW 30u
-#define COUNTER_FINISHED 31u // first of the ring: samples done of each pass in flight
+#define COUNTER_GUIDE_OFF 27u // 1 if the guide does not pay here, and is left out; set by the host
+#define COUNTER_LEARN_LIMIT 28u // first pass that the guide learns nothing from; set by the host
+#define COUNTER_PENDING_CAMERA 29u // rays since the last film launch
+#define COUNTER_PENDING_BOUNCE 30u
+#define COUNTER_PENDING_SHADOW 31u
+#define COUNTER_FINISHED 32u // first of the ring: samples done of each pass in flight
 
 /// Everything that is the same for all paths of a render.
 typedef struct {

@@ -760,6 +760,7 @@ COUNTERS = (
     ("dark_samples_high", "high word"),
     ("guide_failed", "vertices that found their part of the table of the guide full"),
     ("guide_rejected", "what is not finite, or too large for the sums of the guide"),
+    ("guide_off", "1 if the guide does not pay here, and is left out; set by the host"),
     ("learn_limit", "first pass that the guide learns nothing from; set by the host"),
     ("pending_camera", "rays since the last film launch"),
     ("pending_bounce", ""),

@@ -24,11 +24,18 @@ MOST_VISITS = 1 << 28
 LEAST_EDGE, MOST_EDGE = 2.0**-10, 2.0**-3
 
 #: Passes of an epoch that are learned from, once epochs are longer.
-LEARNED_PASSES = 16
+LEARNED_PASSES = 4
 
 
 #: First passes whose epochs count half after each: what was learned from little fades.
 FADING_PASSES = 32
+
+
+#: The guide is left out if it finds, between these passes, that it would leave more noise than this
+#: (it takes about as much time again).  A visit falls into a cell of so many, or nothing is found.
+DECISION_PASSES = range(8, 65)
+MOST_NOISE_LEFT = 0.6
+ENOUGH_VISITS = 256.0
 
 
 def slots_of(pixel_count: int) -> int:
@@ -55,6 +62,31 @@ def parameters(
 def learn_limit(epoch: range) -> int:
     """Return the first pass of the epoch that nothing is learned from."""
     return epoch.start + min(len(epoch), LEARNED_PASSES)
+
+
+def noise_left(cells: np.ndarray, share: float) -> float:
+    """Return the second moment that is left of what the cosine would leave, as the cells expect it.
+
+    Args:
+        cells: records ``layout.GUIDE_CELL``; ``share`` is the setting ``guide_share``.
+
+    A part with the radiance q brings q^2 / density; both are of cells of mean 1, by visits.
+    """
+    taught = cells[cells["visits"] >= layout.CONSTANT["GUIDE_BINS"]]
+    if len(taught) == 0 or share == 0.0:
+        return 1.0
+    density = taught["density"].astype(np.float64)
+    squares = np.maximum((density - (1.0 - share)) / share, 0.0) ** 2
+    visits = taught["visits"].astype(np.float64)[:, None]
+    return float((visits * squares / density).sum() / (visits * squares).sum())
+
+
+def is_worth_it(cells: np.ndarray, share: float) -> bool:
+    """Return whether the guide pays, as far as ``cells`` tell; arguments of ``noise_left``."""
+    visits = cells["visits"].astype(np.float64)
+    if (visits**2).sum() < ENOUGH_VISITS * visits.sum():
+        return True
+    return noise_left(cells, share) <= MOST_NOISE_LEFT
 
 
 def plan(context: Context) -> StageSpec | None:
