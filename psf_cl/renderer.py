@@ -680,7 +680,7 @@ class Renderer:
             fades = start > 0 and passes <= guide.FADING_PASSES
             self.freeze_guide.set(fades=int(fades))
             self.freeze_guide(guide.slots_of(self.plan.pixel_count), film.GROUP)
-        if not left_out and passes in guide.DECISION_PASSES:
+        if not left_out and passes >= guide.FIRST_DECISION:
             cells = self.device.read(self.buffers["guide_cells"])
             left_out = not guide.is_worth_it(cells, self.settings.guide_share)
         end = start + doubling_epoch(passes, self.plan.shortest_epoch) - passes
