@@ -73,11 +73,12 @@ kernel void fit_light_pairs(
     const uint pair = order[level_start + i];
     LightBounds side[2];
     for (uint k = 0; k < 2; ++k) {
-        const uint child = pairs[pair].child[k];
+        uint child = pairs[pair].child[k];
         if (child == NO_LIGHT) {
             side[k] = side[0];
             side[k].power = 0.0f;
         } else {
+            child &= ~GROUP_BIT;
             side[k] =
                 child >= LEAF_BIT ? bounds_of_light(&lights[child & ~LEAF_BIT], power_unit) : bounds[child];
         }

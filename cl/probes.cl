@@ -139,10 +139,17 @@ static inline LightChoice light_for_probe(
     Mask usual)
 {
     const Vec3 above = add_scaled(s.p, s.ng, s.offset);
-    LightChoice choice = choose_light(params, lights CHOICE_ARGUMENTS, mask, above, s.ng, random);
+    LightQuery query;
+    query.p = above;
+    query.n = s.ng;
+#if LIGHT_PHOTONS
+    for (uint size = 0; size < PARTICLE_SIZES; ++size)
+        query.cells[size] = particle_cell(params, s.p, s.ng, size);
+#endif
+    LightChoice choice = choose_light(params, lights CHOICE_ARGUMENTS, mask, &query, random);
     const UInt any = mul_hi(random, (UInt)(params->light_count));
     choice.light = pick_u(usual, choice.light, any);
-    const Float chance = light_chance(params, lights CHOICE_ARGUMENTS, mask, choice.light, above, s.ng);
+    const Float chance = light_chance(params, lights CHOICE_ARGUMENTS, mask, choice.light, query);
     choice.pmf = 0.5f * chance + 0.5f / (float)params->light_count;
     return choice;
 }

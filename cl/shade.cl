@@ -140,6 +140,7 @@ static inline void store_features(
 ///
 /// reads   pool, scene tables
 /// writes  pool.{status, origin, direction, beta, radiance, direct, pdf, shadow, toward, light}; features;
+///         with LIGHT_SAMPLING pool.{light_normal, particle_place, particle_print};
 ///         with CELLS pool.{vertex, length, beyond, share, light_share}, vertices; with GUIDE
 ///         pool.{guide, guide_from, guide_light, expected}, guide_keys, guide_full, guide_sums,
 ///         counters.{guide_failed, guide_rejected} (atomic)
@@ -204,13 +205,19 @@ kernel void shade_paths(
     Vec3 beta = get_v(path, PATH_BETA_R);
     Vec3 emitted = zero;
 
-#if LIGHT_SAMPLING
-    // What lights were chosen for at the last vertex.
-    const Vec3 last_p = get_v(path, PATH_ORIGIN_X);
-    const Vec3 last_n = unpack_unit(get_u(path, PATH_LIGHT_NORMAL));
-#elif CONNECT
-    const Vec3 last_p = zero;
-    const Vec3 last_n = zero;
+#if CONNECT
+    // What a light was chosen for at the last vertex.
+    LightQuery last;
+    last.p = zero;
+    last.n = zero;
+#if LIGHT_TREE
+    last.p = get_v(path, PATH_ORIGIN_X);
+    last.n = unpack_unit(get_u(path, PATH_LIGHT_NORMAL));
+#endif
+#if LIGHT_PHOTONS
+    last.cells[0].place = get_u(path, PATH_PARTICLE_PLACE);
+    last.cells[0].print = get_u(path, PATH_PARTICLE_PRINT);
+#endif
 #endif
 
 #if ENVIRONMENT
@@ -219,7 +226,7 @@ kernel void shade_paths(
         Float pdf_light;
 #if CONNECT
         const Float chance = light_chance(params, lights CHOICE_ARGUMENTS, missed & !camera_ray,
-                                          (UInt)(params->environment_light), last_p, last_n);
+                                          (UInt)(params->environment_light), last);
 #else
         const Float chance = (Float)(0.0f);
 #endif
@@ -256,7 +263,7 @@ kernel void shade_paths(
         const Mask sampled = emits & (s.light != NO_LIGHT);
         const UInt light = pick_u(sampled, s.light, (UInt)(0u));
         const Float chance =
-            light_chance(params, lights CHOICE_ARGUMENTS, sampled & !camera_ray, light, last_p, last_n);
+            light_chance(params, lights CHOICE_ARGUMENTS, sampled & !camera_ray, light, last);
         Float pdf_light =
             area_light_density(lights, light, chance, FIELD(path, PATH_HIT_T), fabs(dot3(s.ng, wo)));
         pdf_light = pick(sampled, pdf_light, (Float)(0.0f));
@@ -422,16 +429,28 @@ kernel void shade_paths(
     if (params->light_count > 0u) {
         const Float away = s.offset;
         const Vec3 above = add_scaled(s.p, s.ng, away);
-#if LIGHT_SAMPLING
+        LightQuery query;
+        query.p = above;
+        query.n = s.ng;
+#if LIGHT_TREE
         // As the next vertex will know it.
         const UInt normal = pack_unit(s.ng);
         put_u(path, PATH_LIGHT_NORMAL, normal);
-        const Vec3 n = unpack_unit(normal);
-#else
-        const Vec3 n = s.ng;
+        query.n = unpack_unit(normal);
 #endif
-        const LightChoice choice =
-            choose_light(params, lights CHOICE_ARGUMENTS, goes_on, above, n, light_bits);
+#if LIGHT_PHOTONS
+        UInt random_x;
+        UInt random_y;
+        sample_bits(seed, index, PAIR_PARTICLES + depth, params->sampler, &random_x, &random_y);
+        const Vec3 near = jittered(params, s.p, s.ng, random_x, random_y);
+        for (uint size = 0; size < PARTICLE_SIZES; ++size)
+            query.cells[size] = particle_cell(params, near, s.ng, size);
+#endif
+        const LightChoice choice = choose_light(params, lights CHOICE_ARGUMENTS, goes_on, &query, light_bits);
+#if LIGHT_PHOTONS
+        put_u(path, PATH_PARTICLE_PLACE, query.cells[0].place);
+        put_u(path, PATH_PARTICLE_PRINT, query.cells[0].print);
+#endif
         const LightSample light = sample_light(params, lights, surfaces,
                                                materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS,
 #if ENVIRONMENT == 2

@@ -36,6 +36,7 @@ from psf_cl.stages import (
     guide,
     intersect,
     metropolis,
+    photons,
     probes,
     restore,
     screen,
@@ -286,6 +287,7 @@ def make_plan(
     stages = []
     for module in (
         animate,
+        photons,
         camera,
         metropolis,
         intersect,
@@ -645,14 +647,17 @@ def _connect(settings: Settings, extended: bool, punctual: bool) -> Feature:
 
 
 def _light_sampling(settings: Settings, connected: bool, lights: int) -> Feature:
-    """Return whether lights are drawn from a tree, and why."""
-    if settings.light_sampling != "hierarchy":
+    """Return how lights are drawn, and why."""
+    if settings.light_sampling in ("power", "uniform"):
         return Feature(0, f"light_sampling is {settings.light_sampling}: a table of chances")
     if not connected:
         return Feature(0, "no light is sampled")
     if lights == 1:
         return Feature(0, "there is one light: nothing to choose")
-    return Feature(1, f"light_sampling is hierarchy: a tree of {lights} lights")
+    if settings.light_sampling == "hierarchy":
+        return Feature(1, f"light_sampling is hierarchy: a tree of {lights} lights")
+    over = 3 if settings.photon_over == "hierarchy" else 2
+    return Feature(over, f"light_sampling is photon: photons of {lights} lights say which are seen")
 
 
 def _light_count(scene: Scene) -> int:
@@ -722,6 +727,7 @@ def _scene_buffers(context: Context, scene: Scene) -> tuple[BufferSpec, ...]:
             BufferSpec("light_bounds", layout.LIGHT_BOUNDS.dtype, lights, "to fit the tree"),
             BufferSpec("light_order", uint32, lights, "levels of the tree"),
             BufferSpec("light_places", uint32, 2 * lights, "where each light is in the tree"),
+            BufferSpec("light_groups", uint32, lights, "small subtrees, which photons tell apart"),
         ]
     if context.features["ENVIRONMENT"].value == 2:
         buffers.append(

@@ -39,7 +39,17 @@ from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Scene
 from psf_cl.scheduler import Hooks, Progress, Scheduler, doubling_epoch
 from psf_cl.settings import Settings, resolve
-from psf_cl.stages import cells, film, guide, metropolis, probes, restore, screen, temporal
+from psf_cl.stages import (
+    cells,
+    film,
+    guide,
+    metropolis,
+    photons,
+    probes,
+    restore,
+    screen,
+    temporal,
+)
 
 #: Looks of the host at the counters for each count of the paths by depth, which takes 0.4 ms on two
 #: CPU cores; the first look, which is left out, is at a pool that is still empty.
@@ -174,7 +184,7 @@ class Renderer:
             start = time.perf_counter()
             self._build_bvh(geometry)
             self.build_seconds = time.perf_counter() - start
-        if self.plan.features["LIGHT_SAMPLING"].value:
+        if "light_pairs" in {spec.name for spec in self.plan.scene_buffers}:
             self._build_light_tree(geometry)
 
     # What happens each bounce, in its order.
@@ -223,6 +233,12 @@ class Renderer:
         if self.chains is not None:
             is_first = start == self.scheduler.first
             self.chains.start() if is_first else self.chains.measure()
+        if self.photon_map is not None:
+            if start == self.scheduler.first:
+                self.photon_map.clear()
+            passes = self.scheduler.epoch_end(start) - start
+            count = photons.photons_for(self.settings, passes, self.plan.pixel_count)
+            self.photon_map.add(count)
 
     # Frames.
 
@@ -656,6 +672,7 @@ class Renderer:
             "guide": self._guide_statistics(counters),
             "cells": self._cell_statistics(counters),
             "metropolis": self.chains.statistics() if self.chains else None,
+            "photons": self.photon_map.counts() if self.photon_map else None,
             "bvh": None
             if self.bvh is None
             else {
@@ -880,6 +897,7 @@ class Renderer:
         values |= metropolis.parameters(settings, self.plan.traits.slots, self.plan.pixel_count)
         values |= temporal.parameters(settings)
         values |= guide.parameters(scene, settings, self.plan.pixel_count, values["scene_radius"])
+        values |= photons.parameters(settings, len(lights))
         for name, value in values.items():
             params[0][name] = value
         return params
@@ -990,6 +1008,11 @@ class Renderer:
             if "guide" in programs
             else None
         )
+        self.photon_map = None
+        if "photons" in programs:
+            intersect = next(s for s in self.plan.stages if s.name == "intersect").kernels[0]
+            paths = intersect.paths_per_item(traits)
+            self.photon_map = photons.PhotonMap(self.device, programs, self.buffers, traits, paths)
         self.film_program = programs["film"]
         self.film_launches = [
             (self._add_launch(ring, name, planes, partial=False), planes)

@@ -64,9 +64,20 @@ class Settings:
         "power",
         "uniform",
         "hierarchy",
+        "photon",
         doc="how next event estimation picks an emitter; hierarchy: a tree of lights asks for what "
-        "each might bring to a surface",
+        "each might bring to a surface; photon: photons tell which of them see it",
     )
+    photons: int = _number(
+        0, 0, 1 << 28, doc="photons before each epoch of light_sampling=photon; 0: half its paths"
+    )
+    photon_cell: float = _number(
+        0.05, 1e-6, 1e6, doc="edge of the smallest cells of photons, by the distance to the camera"
+    )
+    photon_floor: float = _number(
+        0.3, 1e-3, 1.0, doc="least share of the shadow rays that go where no photon said so"
+    )
+    photon_over: str = _choice("hierarchy", "power", doc="how the lights of those are picked")
     direct_sampling: str = _choice(
         "mis", "light", "bsdf", doc="direct light by both strategies, or by one of them alone"
     )
@@ -205,6 +216,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "cell_shrink": False,
     },
     "learned": {"guiding": "learned"},
+    "photon": {"light_sampling": "photon"},
     "mlt": {"integrator": "metropolis"},
 }
 
@@ -231,6 +243,8 @@ def check_together(settings: Settings) -> None:
             raise InputError(
                 f"settings: integrator=metropolis needs {key}={value}; got {getattr(settings, key)}"
             )
+    if settings.light_sampling == "photon":
+        raise InputError("settings: integrator=metropolis goes with any light_sampling but photon")
 
 
 def preset_values(name: str, prefix: str = "settings: ") -> dict[str, Any]:

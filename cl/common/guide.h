@@ -14,6 +14,7 @@
 #include "layout.h"
 #include "hash_map.h"
 #include "cells.h"
+#include "unit_vector.h"
 
 #define NO_PART 0xffffffffu
 
@@ -65,19 +66,6 @@ static inline UInt guide_bin(Float x, Float y)
     const UInt i = to_uint(clamp(u1 * (float)GUIDE_SIDE, (Float)(0.0f), most));
     const UInt j = to_uint(clamp(u2 * (float)GUIDE_SIDE, (Float)(0.0f), most));
     return i * GUIDE_SIDE + j;
-}
-
-/// Side of the cube that a unit vector points to: axis and sign, 0 to 5.
-static inline UInt cube_face(Vec3 n)
-{
-    const Float ax = fabs(n.x);
-    const Float ay = fabs(n.y);
-    const Float az = fabs(n.z);
-    const Mask on_x = (ax >= ay) & (ax >= az);
-    const Mask on_y = ay >= az;
-    const UInt axis = pick_u(on_x, (UInt)(0u), pick_u(on_y, (UInt)(1u), (UInt)(2u)));
-    const Float along = pick(on_x, n.x, pick(on_y, n.y, n.z));
-    return axis * 2u + pick_u(along < 0.0f, (UInt)(1u), (UInt)(0u));
 }
 
 /// Tangents of the unit vector `n` that turn little where `n` does, as long as its cube_face stays.

@@ -2,6 +2,7 @@
 #pragma once
 
 #define LEAF_BIT 0x80000000u // child[] is a block of triangles
+#define GROUP_BIT 0x40000000u // child[] of a LightPair is a group of lights for photons
 #define ALPHA_BIT 0x80000000u // id[] needs its alpha looked up
 #define NO_HIT 0xFFFFFFFFu
 #define NO_LIGHT 0xFFFFFFFFu
@@ -57,6 +58,8 @@
 #define HISTORY_SAME_VIEW 4u // the camera has not moved since
 #define GUIDE_SIDE 8u // parts of the hemisphere a side of the square
 #define GUIDE_BINS 64u
+#define PARTICLE_PLACES 128u // of a cell of the map of photons
+#define PARTICLE_SIZES 3u // of cells of that map, each four times as wide as the one before
 #define BUCKET_SLOTS 64u // slots of a hash map that are probed for a key
 
 #define PATH_ORIGIN_X 0u // ray origin, world, m
@@ -98,56 +101,63 @@
 #else
 #define PATH_END_1 33u
 #endif
-#if BASE >= 1
-#define PATH_BASE_R (PATH_END_1 + 0u) // of what goes to the pixel, what the base of the first surface reflected
-#define PATH_BASE_G (PATH_END_1 + 1u)
-#define PATH_BASE_B (PATH_END_1 + 2u)
-#define PATH_END_2 (PATH_END_1 + 3u)
+#if LIGHT_SAMPLING >= 2
+#define PATH_PARTICLE_PLACE (PATH_END_1 + 0u) // uint; cell of photons that it was chosen from
+#define PATH_PARTICLE_PRINT (PATH_END_1 + 1u) // uint
+#define PATH_END_2 (PATH_END_1 + 2u)
 #else
 #define PATH_END_2 PATH_END_1
 #endif
-#if BASE >= 2
-#define PATH_BASE_SHARE_R (PATH_END_2 + 0u) // part of what comes from beyond that surface that its base reflects
-#define PATH_BASE_SHARE_G (PATH_END_2 + 1u)
-#define PATH_BASE_SHARE_B (PATH_END_2 + 2u)
-#define PATH_BASE_LIGHT_R (PATH_END_2 + 3u) // the same of the shadow ray
-#define PATH_BASE_LIGHT_G (PATH_END_2 + 4u)
-#define PATH_BASE_LIGHT_B (PATH_END_2 + 5u)
-#define PATH_END_3 (PATH_END_2 + 6u)
+#if BASE >= 1
+#define PATH_BASE_R (PATH_END_2 + 0u) // of what goes to the pixel, what the base of the first surface reflected
+#define PATH_BASE_G (PATH_END_2 + 1u)
+#define PATH_BASE_B (PATH_END_2 + 2u)
+#define PATH_END_3 (PATH_END_2 + 3u)
 #else
 #define PATH_END_3 PATH_END_2
 #endif
-#if CELLS >= 1
-#define PATH_VERTEX (PATH_END_3 + 0u) // uint; 1 + depth of the vertex behind which light is shared, VERTEX_NEAR; 0: none
-#define PATH_LENGTH (PATH_END_3 + 1u) // m, from the camera on
-#define PATH_BEYOND_R (PATH_END_3 + 2u) // of what was gathered, what is shared: it came from beyond that vertex
-#define PATH_BEYOND_G (PATH_END_3 + 3u)
-#define PATH_BEYOND_B (PATH_END_3 + 4u)
-#define PATH_END_4 (PATH_END_3 + 5u)
+#if BASE >= 2
+#define PATH_BASE_SHARE_R (PATH_END_3 + 0u) // part of what comes from beyond that surface that its base reflects
+#define PATH_BASE_SHARE_G (PATH_END_3 + 1u)
+#define PATH_BASE_SHARE_B (PATH_END_3 + 2u)
+#define PATH_BASE_LIGHT_R (PATH_END_3 + 3u) // the same of the shadow ray
+#define PATH_BASE_LIGHT_G (PATH_END_3 + 4u)
+#define PATH_BASE_LIGHT_B (PATH_END_3 + 5u)
+#define PATH_END_4 (PATH_END_3 + 6u)
 #else
 #define PATH_END_4 PATH_END_3
 #endif
-#if CELLS >= 2
-#define PATH_SHARE_R (PATH_END_4 + 0u) // part of what comes from beyond the vertex that its diffuse base reflects
-#define PATH_SHARE_G (PATH_END_4 + 1u)
-#define PATH_SHARE_B (PATH_END_4 + 2u)
-#define PATH_LIGHT_SHARE_R (PATH_END_4 + 3u) // the same of the shadow ray
-#define PATH_LIGHT_SHARE_G (PATH_END_4 + 4u)
-#define PATH_LIGHT_SHARE_B (PATH_END_4 + 5u)
-#define PATH_END_5 (PATH_END_4 + 6u)
+#if CELLS >= 1
+#define PATH_VERTEX (PATH_END_4 + 0u) // uint; 1 + depth of the vertex behind which light is shared, VERTEX_NEAR; 0: none
+#define PATH_LENGTH (PATH_END_4 + 1u) // m, from the camera on
+#define PATH_BEYOND_R (PATH_END_4 + 2u) // of what was gathered, what is shared: it came from beyond that vertex
+#define PATH_BEYOND_G (PATH_END_4 + 3u)
+#define PATH_BEYOND_B (PATH_END_4 + 4u)
+#define PATH_END_5 (PATH_END_4 + 5u)
 #else
 #define PATH_END_5 PATH_END_4
 #endif
-#if GUIDE >= 1
-#define PATH_GUIDE (PATH_END_5 + 0u) // uint; part of the guide's cell that the ray left through; NO_PART: none
-#define PATH_GUIDE_FROM (PATH_END_5 + 1u) // uint; that of the ray before the shadow ray
-#define PATH_EXPECTED (PATH_END_5 + 2u) // luminance at the camera that the first vertex was expected to reflect
-#define PATH_GUIDE_LIGHT (PATH_END_5 + 3u) // luminance that arrives through the shadow ray, reflected along that
-#define PATH_END_6 (PATH_END_5 + 4u)
+#if CELLS >= 2
+#define PATH_SHARE_R (PATH_END_5 + 0u) // part of what comes from beyond the vertex that its diffuse base reflects
+#define PATH_SHARE_G (PATH_END_5 + 1u)
+#define PATH_SHARE_B (PATH_END_5 + 2u)
+#define PATH_LIGHT_SHARE_R (PATH_END_5 + 3u) // the same of the shadow ray
+#define PATH_LIGHT_SHARE_G (PATH_END_5 + 4u)
+#define PATH_LIGHT_SHARE_B (PATH_END_5 + 5u)
+#define PATH_END_6 (PATH_END_5 + 6u)
 #else
 #define PATH_END_6 PATH_END_5
 #endif
-#define PATH_FIELD_COUNT PATH_END_6
+#if GUIDE >= 1
+#define PATH_GUIDE (PATH_END_6 + 0u) // uint; part of the guide's cell that the ray left through; NO_PART: none
+#define PATH_GUIDE_FROM (PATH_END_6 + 1u) // uint; that of the ray before the shadow ray
+#define PATH_EXPECTED (PATH_END_6 + 2u) // luminance at the camera that the first vertex was expected to reflect
+#define PATH_GUIDE_LIGHT (PATH_END_6 + 3u) // luminance that arrives through the shadow ray, reflected along that
+#define PATH_END_7 (PATH_END_6 + 4u)
+#else
+#define PATH_END_7 PATH_END_6
+#endif
+#define PATH_FIELD_COUNT PATH_END_7
 
 #define CHAIN_KNOWN 0u // uint; pairs of numbers of the state from which the path starts; 0: a large step
 #define CHAIN_PAIRS 1u // uint; pairs of numbers that the state has
@@ -200,6 +210,14 @@
 #define COUNTER_PENDING_SHADOW 31u
 #define COUNTER_FINISHED 32u // first of the ring: samples done of each pass in flight
 
+#define PHOTONS_EMITTED 0u // with any power
+#define PHOTONS_DARK 1u // drawn where their light gives none
+#define PHOTONS_ESCAPED 2u // left the scene
+#define PHOTONS_STORED 3u // deposits in the map
+#define PHOTONS_ABSORBED 4u // ended at a surface
+#define PHOTONS_CUT 5u // ended by the limit of bounces
+#define PHOTONS_REJECTED 6u // with a power that is not finite
+
 /// Everything that is the same for all paths of a render.
 typedef struct {
     float camera_origin[3]; // world, m
@@ -224,6 +242,10 @@ typedef struct {
     uint roulette_depth; // bounces before roulette
     uint light_count; // entries of the light table
     uint environment_light; // index of the environment in it
+    uint node_bits; // that a node of the tree of lights takes
+    uint particle_cells; // of the map of photons, a power of two
+    float particle_cell; // edge of a cell, m per m from the camera
+    float photon_floor; // chance that a light is drawn whatever photons say
     uint environment_width; // texels
     uint environment_height; // texels
     float environment_radiance[3]; // constant sky, or factor of the image
@@ -317,7 +339,7 @@ typedef struct {
     float offset; // m along ng that clears the rounding error of any point; 0: the triangles' own
     float inverse[9]; // from the world to the mesh, without position, row by row
     float mirroring; // -1 if the mesh is mirrored, else 1
-    uint pad[6]; // fills the record
+    uint pad[2]; // fills the record
 } Instance;
 
 /// A vertex that moves, in its own space.
@@ -464,7 +486,7 @@ typedef struct {
     float power[2]; // of all its lights, as Light.power, in any one unit
     float cos_spread[2]; // of the angle between the axis and any direction that a light faces
     uint axis[2]; // mean direction that the lights face, octahedral, 16 bits a coordinate
-    uint child[2]; // index of a pair, or LEAF_BIT | index of a light; NO_LIGHT if there is none
+    uint child[2]; // index of a pair, or LEAF_BIT | index of a light, and GROUP_BIT; or NO_LIGHT
 } LightPair;
 
 /// What both nodes of a LightPair have in common, to fit their parent.

@@ -5,6 +5,7 @@
 #include "layout.h"
 #include "alpha.h"
 #include "light_tree.h"
+#include "particle_map.h"
 #include "rng.h"
 #include "surface.h"
 
@@ -119,6 +120,61 @@ LARGE_FUNCTION Vec3 eval_environment(
 }
 #endif
 
+#if ENVIRONMENT
+/// Draw a direction to the sky; `u1` and `u2` say where in a texel, other numbers which.
+LARGE_FUNCTION Vec3 sample_environment(
+    __global const Params *params,
+#if ENVIRONMENT == 2
+    __global const EnvironmentCell *cells,
+#endif
+    Seed seed,
+    UInt reversed_index,
+    UInt pair,
+    Float u1,
+    Float u2,
+    Vec3 *radiance,
+    Float *density)
+{
+#if ENVIRONMENT == 2
+    UInt index_bits;
+    UInt alias_bits;
+    sample_bits(seed, reversed_index, pair + PAIR_ENVIRONMENT, params->sampler, &index_bits, &alias_bits);
+    const uint width = params->environment_width;
+    const uint height = params->environment_height;
+    Float unused;
+    UInt cell = alias_slot(index_bits, width * height, &unused);
+    cell = pick_u(unit_float(alias_bits) < GATHER(cells, cell, keep), cell, GATHER_U(cells, cell, other));
+    // float division of indices below 2^24 is exact enough to floor: the remainder is corrected.
+    UInt row = to_uint(to_float(cell) / (float)width);
+    row = pick_u(row * width > cell, row - 1u, row);
+    row = pick_u(cell - row * width >= width, row + 1u, row);
+    const Float u = (to_float(cell - row * width) + u1) / (float)width;
+    const Float v = (to_float(row) + u2) / (float)height;
+    Float sine;
+    Float cosine;
+    Float c;
+    Float si;
+    cos_sin_turns(v * 0.5f, &cosine, &sine);
+    cos_sin_turns(u, &c, &si);
+    const Vec3 l = vec3(sine * si, cosine, -sine * c);
+    __global const float *m = params->environment_rotation;
+    *density = environment_density(params, cells, cell, sine);
+    *radiance = mul(vec3_of(params->environment_radiance), environment_look_up(params, cells, u, v));
+    return vec3(m[0] * l.x + m[3] * l.y + m[6] * l.z, m[1] * l.x + m[4] * l.y + m[7] * l.z,
+                m[2] * l.x + m[5] * l.y + m[8] * l.z);
+#else
+    const Float z = 1.0f - 2.0f * u1;
+    const Float radius = sqrt(max(1.0f - z * z, 0.0f));
+    Float c;
+    Float si;
+    cos_sin_turns(u2, &c, &si);
+    *density = (Float)(0.25f * INV_PI);
+    *radiance = vec3_of(params->environment_radiance);
+    return vec3(radius * c, z, radius * si);
+#endif
+}
+#endif
+
 #if AREA_LIGHTS
 /// Density per solid angle with which sample_light draws a point at distance `t` on an emitter that is
 /// chosen with `chance`.
@@ -133,31 +189,113 @@ static inline Float area_light_density(
 
 // What choosing a light takes beside the table.
 #if LIGHT_SAMPLING
-#define CHOICE_PARAMETERS , __global const LightPair *light_pairs, __global const uint *light_places
-#define CHOICE_ARGUMENTS , light_pairs, light_places
+#define TREE_PARAMETERS , __global const LightPair *light_pairs, __global const uint *light_places
+#define TREE_ARGUMENTS , light_pairs, light_places
 #else
-#define CHOICE_PARAMETERS
-#define CHOICE_ARGUMENTS
+#define TREE_PARAMETERS
+#define TREE_ARGUMENTS
+#endif
+#if LIGHT_PHOTONS
+#define CHOICE_PARAMETERS                                                                          \
+    TREE_PARAMETERS, __global const uint *light_groups, __global const uint *particle_words,       \
+        __global const uint *particle_counts
+#define CHOICE_ARGUMENTS TREE_ARGUMENTS, light_groups, particle_words, particle_counts
+#else
+#define CHOICE_PARAMETERS TREE_PARAMETERS
+#define CHOICE_ARGUMENTS TREE_ARGUMENTS
 #endif
 
-/// Draw a light for a surface at `p` with normal `n`.
+/// What a light is chosen for.  What the choice depends on is the same when a ray that left the vertex
+/// finds a light by chance.
+typedef struct {
+    Vec3 p;
+    Vec3 n;
+#if LIGHT_PHOTONS
+    ParticleCell cells[PARTICLE_SIZES]; // the first: the one that answered
+#endif
+} LightQuery;
+
+/// Draw a light by the chances of the table.
+static inline LightChoice choose_in_table(__global const Light *lights, uint light_count, UInt bits)
+{
+    LightChoice choice;
+    Float alias_u;
+    const UInt slot = alias_slot(bits, light_count, &alias_u);
+    choice.light = pick_u(alias_u < GATHER(lights, slot, keep), slot, GATHER_U(lights, slot, other));
+    choice.pmf = GATHER(lights, choice.light, pmf);
+    return choice;
+}
+
+/// Draw a light for a surface.
+///
+/// Of photons: a group of lights by how many of them came to the cell, then one of the group by what each
+/// might bring; but with a chance that is kept for what no photon saw, whatever photons say.  The cell that
+/// answered is left in `q`.
 static inline LightChoice choose_light(
     __global const Params *params,
     __global const Light *lights CHOICE_PARAMETERS,
     Mask active,
-    Vec3 p,
-    Vec3 n,
+    LightQuery *q,
     UInt bits)
 {
-#if LIGHT_SAMPLING
-    return choose_in_tree(light_pairs, params->light_count, active, p, n, bits);
-#else
+    const uint count = params->light_count;
+#if LIGHT_PHOTONS
+    UInt group;
+    Float kept;
+    Mask blind;
+    Float share = choose_particle(params, particle_words, particle_counts, active, q->cells, &bits, &group,
+                                  &kept, &blind);
+    const Mask known = kept < 1.0f;
+    const Mask seen = active & !blind;
+    const UInt pair = pick_u(seen, group >> 1, (UInt)(0u));
+    const UInt node = pick_u((group & 1u) == 0u, GATHER_U(light_pairs, pair, child[0]),
+                             GATHER_U(light_pairs, pair, child[1]));
     LightChoice choice;
-    Float alias_u;
-    const UInt slot = alias_slot(bits, params->light_count, &alias_u);
-    choice.light = pick_u(alias_u < GATHER(lights, slot, keep), slot, GATHER_U(lights, slot, other));
-    choice.pmf = GATHER(lights, choice.light, pmf);
+    Float blindly;
+#if LIGHT_TREE
+    TreeChoice drawn =
+        descend_tree(light_pairs, count, active, pick_u(seen, node, (UInt)(0u)), q->p, q->n, bits);
+    choice.light = drawn.light;
+    if (any_lane(seen)) {
+        const TreeChoice above = climb_tree(light_pairs, light_places, count, 1, seen, group, q->p, q->n);
+        drawn.above = pick(seen, above.above, drawn.above);
+    }
+    blindly = drawn.above * drawn.inside;
+    Float inside = drawn.inside;
+#else
+    const LightChoice any = choose_in_table(lights, count, bits);
+    Float inside = (Float)(1.0f);
+    choice.light = any.light;
+    if (any_lane(seen)) {
+        const TreeChoice drawn = descend_tree(light_pairs, count, seen, node, q->p, q->n, bits);
+        choice.light = pick_u(seen, drawn.light, choice.light);
+        inside = drawn.inside;
+    }
+    if (any_lane(blind & known)) {
+        const UInt place = GATHER_WORD(light_places, choice.light);
+        const TreeChoice drawn =
+            climb_tree(light_pairs, light_places, count, 0, blind & known, place, q->p, q->n);
+        inside = pick(blind, drawn.inside, inside);
+    }
+    blindly = GATHER(lights, choice.light, pmf);
+#endif
+    if (any_lane(blind & known)) {
+        const UInt its_group = GATHER_WORD(light_groups, choice.light);
+        Float unused;
+        const Float its_share = particle_chance(params, particle_words, particle_counts, blind & known,
+                                                q->cells[0], its_group, &unused);
+        share = pick(blind, its_share, share);
+    }
+    choice.pmf = pick(known, (1.0f - kept) * share * inside + kept * blindly, blindly);
     return choice;
+#elif LIGHT_SAMPLING
+    const TreeChoice drawn = descend_tree(light_pairs, count, active, (UInt)(0u), q->p, q->n, bits);
+    LightChoice choice;
+    choice.light = drawn.light;
+    choice.pmf = pick(active, drawn.above * drawn.inside, (Float)(0.0f));
+    return choice;
+#else
+    return choose_in_table(lights, count, bits);
 #endif
 }
 
@@ -167,13 +305,26 @@ static inline Float light_chance(
     __global const Light *lights CHOICE_PARAMETERS,
     Mask active,
     UInt light,
-    Vec3 p,
-    Vec3 n)
+    LightQuery q)
 {
 #if LIGHT_SAMPLING
-    return chance_in_tree(light_pairs, light_places, params->light_count, active, light, p, n);
+    const UInt wanted = pick_u(active, light, (UInt)(0u));
+    const UInt place = GATHER_WORD(light_places, wanted);
+    const TreeChoice drawn = climb_tree(light_pairs, light_places, params->light_count, LIGHT_TREE, active,
+                                        place, q.p, q.n);
+#endif
+#if LIGHT_TREE
+    const Float blindly = drawn.above * drawn.inside;
 #else
-    return GATHER(lights, light, pmf);
+    const Float blindly = GATHER(lights, light, pmf);
+#endif
+#if LIGHT_PHOTONS
+    Float kept;
+    const Float share = particle_chance(params, particle_words, particle_counts, active, q.cells[0],
+                                        GATHER_WORD(light_groups, wanted), &kept);
+    return pick(kept < 1.0f, (1.0f - kept) * share * drawn.inside + kept * blindly, blindly);
+#else
+    return blindly;
 #endif
 }
 
@@ -256,49 +407,18 @@ LARGE_FUNCTION LightSample sample_light(
 #if ENVIRONMENT
     const Mask in_sky = active & (kind == LIGHT_ENVIRONMENT);
     if (any_lane(in_sky)) {
+        Float density;
+        Vec3 radiance;
+        const Vec3 wi = sample_environment(params,
 #if ENVIRONMENT == 2
-        UInt index_bits;
-        UInt alias_bits;
-        sample_bits(seed, reversed_index, pair + PAIR_ENVIRONMENT, params->sampler, &index_bits, &alias_bits);
-        const uint width = params->environment_width;
-        const uint height = params->environment_height;
-        Float unused;
-        UInt cell = alias_slot(index_bits, width * height, &unused);
-        cell = pick_u(unit_float(alias_bits) < GATHER(cells, cell, keep), cell, GATHER_U(cells, cell, other));
-        // float division of indices below 2^24 is exact enough to floor: the remainder is corrected.
-        UInt row = to_uint(to_float(cell) / (float)width);
-        row = pick_u(row * width > cell, row - 1u, row);
-        row = pick_u(cell - row * width >= width, row + 1u, row);
-        const Float u = (to_float(cell - row * width) + u1) / (float)width;
-        const Float v = (to_float(row) + u2) / (float)height;
-        Float sine;
-        Float cosine;
-        Float c;
-        Float si;
-        cos_sin_turns(v * 0.5f, &cosine, &sine);
-        cos_sin_turns(u, &c, &si);
-        const Vec3 l = vec3(sine * si, cosine, -sine * c);
-        __global const float *m = params->environment_rotation;
-        const Vec3 wi = vec3(m[0] * l.x + m[3] * l.y + m[6] * l.z, m[1] * l.x + m[4] * l.y + m[7] * l.z,
-                             m[2] * l.x + m[5] * l.y + m[8] * l.z);
-        const Float pdf = pmf * environment_density(params, cells, cell, sine);
-        const Vec3 radiance =
-            mul(vec3_of(params->environment_radiance), environment_look_up(params, cells, u, v));
-#else
-        const Float z = 1.0f - 2.0f * u1;
-        const Float radius = sqrt(max(1.0f - z * z, 0.0f));
-        Float c;
-        Float si;
-        cos_sin_turns(u2, &c, &si);
-        const Vec3 wi = vec3(radius * c, z, radius * si);
-        const Float pdf = pmf * (0.25f * INV_PI);
-        const Vec3 radiance = vec3_of(params->environment_radiance);
+                                           cells,
 #endif
+                                           seed, reversed_index, pair, u1, u2, &radiance, &density);
         s.wi = pick_v(in_sky, wi, s.wi);
         // Far enough to leave the scene from any point of it.
         s.toward = pick_v(in_sky, scale(wi, (Float)(4.0f * params->scene_radius)), s.toward);
         s.radiance = pick_v(in_sky, radiance, s.radiance);
-        s.pdf = pick(in_sky, pdf, s.pdf);
+        s.pdf = pick(in_sky, pmf * density, s.pdf);
     }
 #endif
 

@@ -87,64 +87,88 @@ LARGE_FUNCTION Float left_chance(__global const LightPair *pairs, UInt pair, Vec
     return pick(both, clamp(chance, (Float)(LEAST_LIGHT_SHARE), (Float)(1.0f - LEAST_LIGHT_SHARE)), one);
 }
 
-/// Draw a light for a surface at `p` with normal `n`.
+/// A light of the tree, and the chances of the two parts of the way to it.
+typedef struct {
+    UInt light;
+    Float above;  // that its group is drawn from the root
+    Float inside; // that the light is drawn from its group
+} TreeChoice;
+
+/// Draw a light for a surface at `p` with normal `n`, from the nodes `child` of pairs on.
 ///
 /// The random number goes from node to node: what is left of it is uniform in the node that was drawn.
 /// Digits that it runs out of are made up.
-LARGE_FUNCTION LightChoice choose_in_tree(
-    __global const LightPair *pairs, uint light_count, Mask active, Vec3 p, Vec3 n, UInt bits)
+LARGE_FUNCTION TreeChoice descend_tree(
+    __global const LightPair *pairs, uint light_count, Mask active, UInt child, Vec3 p, Vec3 n, UInt bits)
 {
-    LightChoice choice;
-    choice.light = (UInt)(0u);
-    choice.pmf = pick(active, (Float)(1.0f), (Float)(0.0f));
-    UInt pair = (UInt)(0u);
+    TreeChoice choice;
+    choice.light = child & ~LEAF_BIT & ~GROUP_BIT;
+    choice.above = (Float)(1.0f);
+    choice.inside = (Float)(1.0f);
     Float u = unit_float(bits);
-    Mask inner = active;
+    Mask inner = active & (child < LEAF_BIT);
+    UInt pair = pick_u(inner, choice.light, (UInt)(0u));
     // No tree is deeper than it has leaves.
     for (uint level = 0; level <= light_count && any_lane(inner); ++level) {
         const Float chance = left_chance(pairs, pair, p, n);
         const Mask left = u < chance;
         const Float share = pick(left, chance, 1.0f - chance);
-        choice.pmf = pick(inner, choice.pmf * share, choice.pmf);
         const Float scale = 1.0f / max(share, 0x1p-30f);
         bits = mix_bits(bits + 0x9e3779b9u);
         const Float rest = (pick(left, u, u - chance) + 0x1p-24f * unit_float(bits)) * scale;
         u = clamp(rest, (Float)(0.0f), (Float)(0x1.fffffep-1f));
-        const UInt child = pick_u(left, GATHER_U(pairs, pair, child[0]), GATHER_U(pairs, pair, child[1]));
-        const Mask leaf = child >= LEAF_BIT;
+        child = pick_u(left, GATHER_U(pairs, pair, child[0]), GATHER_U(pairs, pair, child[1]));
         // Where no light was fit for the tree, its only pair leads nowhere.
         const Mask there = child != NO_LIGHT;
+        const Float so_far = pick(there, choice.inside * share, (Float)(0.0f));
+        const Mask group = inner & ((child & GROUP_BIT) != 0u);
+        choice.above = pick(group, so_far, choice.above);
+        choice.inside = pick(group, (Float)(1.0f), pick(inner, so_far, choice.inside));
+        child &= ~GROUP_BIT;
+        const Mask leaf = child >= LEAF_BIT;
         choice.light = pick_u(inner & leaf & there, child & ~LEAF_BIT, choice.light);
-        choice.pmf = pick(inner & !there, (Float)(0.0f), choice.pmf);
         inner &= !leaf;
         pair = pick_u(inner, child, (UInt)(0u));
     }
     return choice;
 }
 
-/// Chance with which choose_in_tree draws `light` at `p`.
+/// Chances of the node at `place`, as 2 * pair + side, from its group and from the root.
 ///
-/// `places`: 2 * pair + side of every light, then of every pair; NO_LIGHT for those that have none.
-LARGE_FUNCTION Float chance_in_tree(
+/// `places`: that of every light, then of every pair; NO_LIGHT for those that have none, which are never
+/// drawn.  If not `whole`, only what is inside of the group matters.
+LARGE_FUNCTION TreeChoice climb_tree(
     __global const LightPair *pairs,
     __global const uint *places,
     uint light_count,
+    int whole,
     Mask active,
-    UInt light,
+    UInt place,
     Vec3 p,
     Vec3 n)
 {
-    UInt place = GATHER_WORD(places, pick_u(active, light, (UInt)(0u)));
+    TreeChoice choice;
     Mask climbs = active & (place != NO_LIGHT);
-    Float pmf = pick(climbs, (Float)(1.0f), (Float)(0.0f));
-    for (uint level = 0; level <= light_count && any_lane(climbs); ++level) {
+    choice.light = (UInt)(0u);
+    choice.above = pick(climbs, (Float)(1.0f), (Float)(0.0f));
+    choice.inside = choice.above;
+    Mask inside = climbs;
+    for (uint level = 0; level <= light_count; ++level) {
         const UInt pair = pick_u(climbs, place >> 1, (UInt)(0u));
+        const Mask left = (place & 1u) == 0u;
+        const UInt child = pick_u(left, GATHER_U(pairs, pair, child[0]), GATHER_U(pairs, pair, child[1]));
+        inside &= (child & GROUP_BIT) == 0u;
+        if (!whole)
+            climbs &= inside;
+        if (!any_lane(climbs))
+            break;
         const Float chance = left_chance(pairs, pair, p, n);
-        const Float share = pick((place & 1u) == 0u, chance, 1.0f - chance);
-        pmf = pick(climbs, pmf * share, pmf);
+        const Float share = pick(left, chance, 1.0f - chance);
+        choice.inside = pick(climbs & inside, choice.inside * share, choice.inside);
+        choice.above = pick(climbs & !inside, choice.above * share, choice.above);
         place = GATHER_WORD(places, light_count + pair);
         climbs &= place != NO_LIGHT;
     }
-    return pmf;
+    return choice;
 }
 #endif

@@ -8,6 +8,8 @@
 // Dimensions come in pairs.  A vertex at `depth` owns VERTEX_PAIRS of them from PAIR_VERTEX on.
 #define PAIR_PIXEL 0u
 #define PAIR_LENS 1u
+// From here on by depth: where a vertex is moved to before it looks for photons.
+#define PAIR_PARTICLES 0xff000000u
 #define PAIR_BSDF 0u
 #define PAIR_LIGHT 1u
 #define PAIR_CHOICE 2u      // which lobe, then whether to go on; which light

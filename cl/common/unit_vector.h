@@ -33,3 +33,16 @@ static inline Vec3 unpack_direction(UInt packed)
 }
 
 static inline Vec3 unpack_unit(UInt packed) { return normalize3(unpack_direction(packed)); }
+
+/// Side of the cube that a unit vector points to: axis and sign, 0 to 5.
+static inline UInt cube_face(Vec3 n)
+{
+    const Float ax = fabs(n.x);
+    const Float ay = fabs(n.y);
+    const Float az = fabs(n.z);
+    const Mask on_x = (ax >= ay) & (ax >= az);
+    const Mask on_y = ay >= az;
+    const UInt axis = pick_u(on_x, (UInt)(0u), pick_u(on_y, (UInt)(1u), (UInt)(2u)));
+    const Float along = pick(on_x, n.x, pick(on_y, n.y, n.z));
+    return axis * 2u + pick_u(along < 0.0f, (UInt)(1u), (UInt)(0u));
+}

@@ -89,6 +89,10 @@ PARAMS = Record(
     uint roulette_depth - bounces before roulette
     uint light_count - entries of the light table
     uint environment_light - index of the environment in it
+    uint node_bits - that a node of the tree of lights takes
+    uint particle_cells - of the map of photons, a power of two
+    float particle_cell - edge of a cell, m per m from the camera
+    float photon_floor - chance that a light is drawn whatever photons say
     uint environment_width - texels
     uint environment_height - texels
     float environment_radiance[3] - constant sky, or factor of the image
@@ -196,7 +200,7 @@ INSTANCE = Record(
     float offset - m along ng that clears the rounding error of any point; 0: the triangles' own
     float inverse[9] - from the world to the mesh, without position, row by row
     float mirroring - -1 if the mesh is mirrored, else 1
-    uint pad[6] - fills the record
+    uint pad[2] - fills the record
     """),
 )
 
@@ -379,7 +383,7 @@ LIGHT_PAIR = Record(
     float power[2] - of all its lights, as Light.power, in any one unit
     float cos_spread[2] - of the angle between the axis and any direction that a light faces
     uint axis[2] - mean direction that the lights face, octahedral, 16 bits a coordinate
-    uint child[2] - index of a pair, or LEAF_BIT | index of a light; NO_LIGHT if there is none
+    uint child[2] - index of a pair, or LEAF_BIT | index of a light, and GROUP_BIT; or NO_LIGHT
     """),
 )
 
@@ -654,6 +658,14 @@ OPTIONAL_PATH_FIELDS = (
         (("light_normal", "uint; packed: what the last light was chosen for, besides the origin"),),
     ),
     (
+        "LIGHT_SAMPLING",
+        2,
+        (
+            ("particle_place", "uint; cell of photons that it was chosen from"),
+            ("particle_print", "uint"),
+        ),
+    ),
+    (
         "BASE",
         1,
         (
@@ -731,6 +743,17 @@ CHAIN_FIELDS = (
     ("small_accepted", "uint"),
 )
 
+#: Words of the counters of photons, all uint: what became of those that were emitted.
+PHOTON_COUNTERS = (
+    ("emitted", "with any power"),
+    ("dark", "drawn where their light gives none"),
+    ("escaped", "left the scene"),
+    ("stored", "deposits in the map"),
+    ("absorbed", "ended at a surface"),
+    ("cut", "ended by the limit of bounces"),
+    ("rejected", "with a power that is not finite"),
+)
+
 #: Words of the counters, all uint.
 COUNTERS = (
     ("next_pixel", "next pixel to be started, counted from the first pixel of next_pass"),
@@ -770,6 +793,7 @@ COUNTERS = (
 
 CONSTANTS = (
     ("LEAF_BIT", 0x80000000, "child[] is a block of triangles"),
+    ("GROUP_BIT", 0x40000000, "child[] of a LightPair is a group of lights for photons"),
     ("ALPHA_BIT", 0x80000000, "id[] needs its alpha looked up"),
     ("NO_HIT", 0xFFFFFFFF, ""),
     ("NO_LIGHT", 0xFFFFFFFF, ""),
@@ -825,6 +849,8 @@ CONSTANTS = (
     ("HISTORY_SAME_VIEW", 4, "the camera has not moved since"),
     ("GUIDE_SIDE", GUIDE_SIDE, "parts of the hemisphere a side of the square"),
     ("GUIDE_BINS", GUIDE_SIDE**2, ""),
+    ("PARTICLE_PLACES", 128, "of a cell of the map of photons"),
+    ("PARTICLE_SIZES", 3, "of cells of that map, each four times as wide as the one before"),
     ("BUCKET_SLOTS", 64, "slots of a hash map that are probed for a key"),
 )
 
@@ -839,6 +865,8 @@ _FRAME = """\
 {chains}
 
 {counters}
+
+{photon_counters}
 
 {records}
 """
@@ -899,6 +927,10 @@ def header() -> str:
         counters="\n".join(
             define(f"COUNTER_{name.upper()}", index, meaning)
             for index, (name, meaning) in enumerate(COUNTERS)
+        ),
+        photon_counters="\n".join(
+            define(f"PHOTONS_{name.upper()}", index, meaning)
+            for index, (name, meaning) in enumerate(PHOTON_COUNTERS)
         ),
         records="\n\n".join(record.c_text() for record in RECORDS),
     )

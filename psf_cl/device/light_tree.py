@@ -17,6 +17,9 @@ _NONE = CONSTANT["NO_LIGHT"]
 _FAR = (CONSTANT["LIGHT_ENVIRONMENT"], CONSTANT["LIGHT_DIRECTIONAL"])
 _GROUP = 64
 
+#: Lights of a subtree that photons do not tell apart: the sides of a lamp are about as many.
+GROUP_LIGHTS = 16
+
 
 @dataclass(frozen=True)
 class Topology:
@@ -27,11 +30,13 @@ class Topology:
             NO_LIGHT.  Pair 0 is the root.
         levels: the pairs of each level from the root down.
         places: ``(lights + p,)`` uint32, 2 * pair + side of every light, then of every pair.
+        groups: ``(lights,)`` uint32, the same of the subtree of at most GROUP_LIGHTS around each.
     """
 
     links: np.ndarray
     levels: list[np.ndarray]
     places: np.ndarray
+    groups: np.ndarray
 
 
 class LightTree:
@@ -59,6 +64,7 @@ class LightTree:
         self.buffers = {
             "light_pairs": device.upload("light_pairs", pairs),
             "light_places": device.upload("light_places", topology.places),
+            "light_groups": device.upload("light_groups", topology.groups),
             "light_order": device.upload("light_order", np.concatenate(topology.levels)),
             "light_bounds": device.allocate("light_bounds", LIGHT_BOUNDS.dtype, len(pairs)),
         }
@@ -172,4 +178,23 @@ def _from_the_root(links: np.ndarray, light_count: int) -> Topology:
     while len(levels[-1]):
         children = links[levels[-1]].reshape(-1)
         levels.append(children[children < _LEAF].astype(np.uint32))
-    return Topology(links.astype(np.uint32), levels[:-1], places)
+    levels = levels[:-1]
+    sizes = np.zeros(pairs, np.int64)
+    below = np.zeros((pairs, 2), np.int64)
+    for level in reversed(levels):
+        inner = links[level] < _LEAF
+        below[level] = np.where(leaf[level], 1, 0)
+        below[level] += np.where(inner, sizes[np.where(inner, links[level], 0)], 0)
+        sizes[level] = below[level].sum(axis=1)
+    # The root is no node of a pair: its children are the largest groups that there can be.
+    whole = np.where(np.arange(pairs) == 0, GROUP_LIGHTS + 1, sizes)[:, None]
+    tops = (below > 0) & (below <= GROUP_LIGHTS) & (whole > GROUP_LIGHTS)
+    groups = np.full(light_count, _NONE, np.uint32)
+    around = np.full(pairs, _NONE, np.int64)
+    for level in levels:
+        of = np.where(tops[level], slots[level], around[level][:, None])
+        children, inner = links[level], links[level] < _LEAF
+        around[children[inner]] = of[inner]
+        groups[children[leaf[level]] & ~_LEAF] = of[leaf[level]]
+    links = np.where(tops, links | CONSTANT["GROUP_BIT"], links)
+    return Topology(links.astype(np.uint32), levels, places, groups)

@@ -34,8 +34,10 @@ kernel void sample_lights(
     UInt unused_bits;
     UInt choice;
     sample_bits(seed, index, pair + PAIR_CHOICE, params->sampler, &unused_bits, &choice);
-    const LightChoice light = choose_light(params, lights, LOAD_U(active, 0) != 0u, LOAD_V(origin, 0),
-                                           LOAD_V(origin, 0), choice);
+    LightQuery query;
+    query.p = LOAD_V(origin, 0);
+    query.n = query.p;
+    const LightChoice light = choose_light(params, lights, LOAD_U(active, 0) != 0u, &query, choice);
     const LightSample s = sample_light(params, lights, surfaces, materials,
 #if TEXTURES
                                        uvs, textures, texels, srgb_to_linear,

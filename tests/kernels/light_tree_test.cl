@@ -3,7 +3,7 @@
 #include "planes.h"
 #include "../../cl/common/light_tree.h"
 
-/// Lights drawn for points (position, normal) with random `bits`; what chance_in_tree says of them.
+/// Lights drawn for points (position, normal) with random `bits`; what climbing says of them.
 kernel void draw_lights(
     global const LightPair *light_pairs,
     global const uint *light_places,
@@ -16,11 +16,14 @@ kernel void draw_lights(
 {
     const Vec3 p = LOAD_V(points, 0);
     const Vec3 n = LOAD_V(points, 3);
-    const LightChoice choice = choose_in_tree(light_pairs, light_count, MASK_ALL, p, n, LOAD_U(bits, 0));
+    const TreeChoice choice = descend_tree(light_pairs, light_count, MASK_ALL, (UInt)(0u), p, n, LOAD_U(bits, 0));
+    const TreeChoice back = climb_tree(light_pairs, light_places, light_count, 1, MASK_ALL,
+                                       GATHER_WORD(light_places, choice.light), p, n);
+    const TreeChoice inside = climb_tree(light_pairs, light_places, light_count, 0, MASK_ALL,
+                                         GATHER_WORD(light_places, choice.light), p, n);
     STORE_U(drawn, 0, choice.light);
-    STORE(pmfs, 0, choice.pmf);
-    const Mask any = choice.pmf > 0.0f;
-    STORE(chances, 0, chance_in_tree(light_pairs, light_places, light_count, any, choice.light, p, n));
+    STORE(pmfs, 0, choice.above * choice.inside);
+    STORE(chances, 0, back.above * inside.inside);
 }
 
 /// Chances of `light` at points.
@@ -32,6 +35,8 @@ kernel void list_chances(
     global const uint *light,
     global float *chances)
 {
-    STORE(chances, 0, chance_in_tree(light_pairs, light_places, light_count, MASK_ALL, LOAD_U(light, 0),
-                                     LOAD_V(points, 0), LOAD_V(points, 3)));
+    const UInt place = GATHER_WORD(light_places, LOAD_U(light, 0));
+    const TreeChoice choice = climb_tree(light_pairs, light_places, light_count, 1, MASK_ALL, place,
+                                         LOAD_V(points, 0), LOAD_V(points, 3));
+    STORE(chances, 0, choice.above * choice.inside);
 }

@@ -1,0 +1,146 @@
+"""Photons: from all lights into a map that says which of them light a place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from psf_cl.device import layout
+from psf_cl.settings import Settings
+from psf_cl.stages.spec import POOL_FLAGS, BufferSpec, Context, KernelSpec, StageSpec
+
+if TYPE_CHECKING:
+    from psf_cl.device.device import Buffer, Device
+    from psf_cl.device.program import Launch, Program
+    from psf_cl.traits import DeviceTraits
+
+#: Photons of an epoch if it is not said how many: as many as a share of its camera paths.
+SHARE_OF_PATHS = 0.5
+FEWEST, MOST = 1 << 15, 1 << 20
+
+#: Cells of the map, a power of two.
+CELLS = 1 << 15
+
+
+def photons_for(settings: Settings, passes: int, pixel_count: int) -> int:
+    """Return the photons to emit before an epoch of so many passes."""
+    if settings.photons:
+        return settings.photons
+    return int(min(max(SHARE_OF_PATHS * passes * pixel_count, FEWEST), MOST))
+
+
+def parameters(settings: Settings, light_count: int) -> dict[str, object]:
+    """Return what the kernels need to know, by the names of ``layout.PARAMS``."""
+    return {
+        "node_bits": max(2 * light_count - 1, 0).bit_length(),
+        "particle_cells": CELLS,
+        "particle_cell": settings.photon_cell,
+        "photon_floor": settings.photon_floor,
+    }
+
+
+def plan(context: Context) -> StageSpec | None:
+    """Return the stage, or None if no photon is needed."""
+    if context.features["LIGHT_SAMPLING"].value < 2:
+        return None
+    uint32 = np.dtype(np.uint32)
+    places = CELLS * layout.CONSTANT["PARTICLE_PLACES"]
+    words = context.traits.slots * context.path_field_count
+    kernels = (
+        KernelSpec(
+            "emit_photons",
+            writes=("status", "origin", "direction", "beta", "seed", "sample", "pixel", "toward_x"),
+            record_bytes=layout.LIGHT.dtype.itemsize,
+        ),
+        KernelSpec(
+            "store_photons",
+            reads=("status", "direction", "hit", "sample", "pixel"),
+            writes=("shadow", "status"),
+            record_bytes=layout.SURFACE.dtype.itemsize + 8,
+            hash_accesses=1,
+        ),
+        KernelSpec("settle_photons", reads=("shadow",), record_bytes=8, hash_accesses=1),
+    )
+    return StageSpec(
+        "photons",
+        "photons say which lights a place sees",
+        "photons.cl",
+        flags=(
+            "TEXTURES",
+            "VERTEX_COLORS",
+            "AREA_LIGHTS",
+            "PUNCTUAL_LIGHTS",
+            "ENVIRONMENT",
+            "ALPHA",
+            "INSTANCES",
+            *POOL_FLAGS,
+        ),
+        kernels=kernels,
+        buffers=(
+            BufferSpec("photons", np.dtype(np.float32), words, "photons in flight", True),
+            BufferSpec(
+                "photon_counters", uint32, len(layout.COUNTERS) + context.ring, "of photons"
+            ),
+            BufferSpec("particle_keys", uint32, places, "least random number of each place"),
+            BufferSpec("particle_counts", uint32, places, "photons that came to it"),
+            BufferSpec("particle_words", uint32, places, "light and cell of the one that stayed"),
+        ),
+        per_pass=True,
+        between_passes=True,
+    )
+
+
+class PhotonMap:
+    """Fills the map between epochs; photons of earlier epochs of the frame stay in it."""
+
+    def __init__(
+        self,
+        device: Device,
+        programs: Mapping[str, Program],
+        buffers: Mapping[str, Buffer],
+        traits: DeviceTraits,
+        runs_per_trace: int,
+    ) -> None:
+        """Bind the kernels; ``runs_per_trace`` are the paths of an item of intersect_closest."""
+        self.device, self.buffers, self.traits = device, buffers, traits
+        own = programs["photons"]
+        traced = dict(buffers) | {
+            "pool": buffers["photons"],
+            "counters": buffers["photon_counters"],
+        }
+        self.emit = own.bind_planned("emit_photons", buffers, first=0, count=0)
+        self.store = own.bind_planned("store_photons", buffers)
+        self.settle = own.bind_planned("settle_photons", buffers)
+        self.trace = programs["intersect"].bind_planned("intersect_closest", traced)
+        self.trace_items = -(-traits.slots // runs_per_trace)
+
+    def clear(self) -> None:
+        """Forget all photons."""
+        self.device.fill(self.buffers["particle_keys"], 0xFF)
+        for name in ("particle_counts", "particle_words", "photon_counters"):
+            self.device.fill(self.buffers[name])
+
+    def add(self, count: int) -> None:
+        """Emit ``count`` photons and enqueue that the map keeps them."""
+        first, items = self.drawn(), -(-self.traits.slots // self.traits.lanes)
+        for start in range(0, count, self.traits.slots):
+            batch = min(count - start, self.traits.slots)
+            # Numbers of 32 bits: they begin again.
+            self.emit.set(first=(first + start) % (1 << 32), count=batch)(items)
+            self.trace(self.trace_items)
+            launches: tuple[Launch, ...] = (self.store, self.settle)
+            for launch in launches:
+                launch(items)
+
+    def counts(self) -> dict[str, int]:
+        """Return what became of the photons so far, by the names of ``layout.PHOTON_COUNTERS``."""
+        names = [name for name, _ in layout.PHOTON_COUNTERS]
+        values = self.device.read(self.buffers["photon_counters"], len(names))
+        return dict(zip(names, map(int, values), strict=True))
+
+    def drawn(self) -> int:
+        """Return how many photons were drawn since the map was cleared."""
+        counts = self.counts()
+        return counts["emitted"] + counts["dark"] + counts["rejected"]

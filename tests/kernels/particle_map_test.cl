@@ -1,0 +1,68 @@
+// The functions of particle_map.h: particles of given cells, one a lane.
+
+#include "planes.h"
+#include "../../cl/common/particle_map.h"
+
+/// cells: a number of the cell of each particle; nodes: below which its light is; numbers: its own.
+kernel void insert_particles(
+    global const Params *params,
+    volatile global uint *keys,
+    volatile global uint *counts,
+    global const uint *cells,
+    global const uint *nodes,
+    global const uint *numbers)
+{
+    const UInt place = particle_place(cell_of_hash(params, mix_bits(LOAD_U(cells, 0))), LOAD_U(nodes, 0));
+    uint lane_place[W];
+    uint lane_key[W];
+    store_lanes_u(place, lane_place);
+    store_lanes_u(mix_bits(LOAD_U(numbers, 0) ^ params->seed), lane_key);
+    for (uint k = 0; k < W; ++k)
+        insert_particle(keys, counts, lane_place[k], lane_key[k]);
+}
+
+/// After all are in: what those leave that have won.
+kernel void settle_particles(
+    global const Params *params,
+    global const uint *keys,
+    global uint *words,
+    global const uint *cells,
+    global const uint *nodes,
+    global const uint *numbers)
+{
+    const ParticleCell cell = cell_of_hash(params, mix_bits(LOAD_U(cells, 0)));
+    uint lane_place[W];
+    uint lane_key[W];
+    uint lane_word[W];
+    store_lanes_u(particle_place(cell, LOAD_U(nodes, 0)), lane_place);
+    store_lanes_u(mix_bits(LOAD_U(numbers, 0) ^ params->seed), lane_key);
+    store_lanes_u(particle_word(params, cell, LOAD_U(nodes, 0)), lane_word);
+    for (uint k = 0; k < W; ++k)
+        if (keys[lane_place[k]] == lane_key[k])
+            words[lane_place[k]] = lane_word[k];
+}
+
+/// Share of the particles of a cell that are from below a node.
+kernel void list_shares(
+    global const Params *params,
+    global const uint *words,
+    global const uint *counts,
+    global const uint *cells,
+    global const uint *nodes,
+    global float *shares,
+    global float *kept)
+{
+    Float rest;
+    const ParticleCell cell = cell_of_hash(params, mix_bits(LOAD_U(cells, 0)));
+    STORE(shares, 0, particle_chance(params, words, counts, MASK_ALL, cell, LOAD_U(nodes, 0), &rest));
+    STORE(kept, 0, rest);
+}
+
+/// The first place of each cell, and what tells its particles from others.
+kernel void list_cells(
+    global const Params *params, global const uint *cells, global uint *places, global uint *prints)
+{
+    const ParticleCell cell = cell_of_hash(params, mix_bits(LOAD_U(cells, 0)));
+    STORE_U(places, 0, cell.place);
+    STORE_U(prints, 0, cell.print);
+}
