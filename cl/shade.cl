@@ -519,7 +519,7 @@ kernel void shade_paths(
 #endif
 #endif
 #if GUIDE
-    const Vec3 before = beta;
+    const Vec3 beta_here = beta;
 #endif
     beta = mul(beta, scale(f, 1.0f / pick(pdf > 0.0f, pdf, (Float)(1.0f))));
     const Float carried = beta.x + beta.y + beta.z;
@@ -538,7 +538,7 @@ kernel void shade_paths(
 #endif
     Float chance = pick(roulette, min(worth, (Float)(MAX_SURVIVAL)), (Float)(1.0f));
 #if GUIDE
-    const Float to_come = luminance(mul(before, b.base_color)) * guide.mean;
+    const Float to_come = luminance(mul(beta_here, b.base_color)) * guide.mean;
     const Float expected = pick(camera_ray, to_come, FIELD(path, PATH_EXPECTED));
     FIELD(path, PATH_EXPECTED) = expected;
     chance = pick(roulette, informed_chance(to_come, expected, chance), chance);

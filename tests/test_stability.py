@@ -155,3 +155,8 @@ def test_the_table_of_extremes_has_no_failure(preset):
     command = [sys.executable, "tools/stability.py", "--presets", preset, "--no-times"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout
+
+
+def test_the_guide_and_the_filter_of_the_picture_build_together(device):
+    settings = {"guiding": "learned", "screen_filter": "path_space"}
+    assert np.isfinite(render(device, furnace(), 2, **settings).rgb).all()
