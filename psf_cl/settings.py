@@ -218,6 +218,16 @@ PRESETS: dict[str, dict[str, Any]] = {
     "learned": {"guiding": "learned"},
     "photon": {"light_sampling": "photon"},
     "mlt": {"integrator": "metropolis"},
+    # Few samples for each of many frames: all that makes a picture calm, none of it for precision.
+    "game": {
+        "light_sampling": "photon",
+        "guiding": "learned",
+        "path_filter": "hash_grid",
+        "filter_vertex": "1",
+        "filter_direct": False,
+        "temporal": "adaptive",
+        "screen_filter": "path_space",
+    },
 }
 
 
