@@ -150,3 +150,21 @@ kernel void settle_photons(
                 particle_words[place[k]] = word[k];
     }
 }
+
+/// Make the table that paths ask of the places of the map.  One work item those of a cell.
+///
+/// reads   particle_words, particle_counts
+/// writes  particle_kinds, particle_sums, particle_runs
+kernel void tabulate_photons(
+    __global const Params *params,
+    __global const uint *particle_words,
+    __global const uint *particle_counts,
+    __global uint *particle_kinds,
+    __global uint *particle_sums,
+    __global uint *particle_runs)
+{
+    const uint cell = get_global_id(0);
+    if (cell >= params->particle_cells)
+        return;
+    tabulate_cell(params, particle_words, particle_counts, particle_kinds, particle_sums, particle_runs, cell);
+}

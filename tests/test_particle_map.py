@@ -10,6 +10,9 @@ FILE = "particle_map_test.cl"
 PLACES = layout.CONSTANT["PARTICLE_PLACES"]
 NODE_BITS = 8
 CELLS = 64
+FULL = 0xFFFFFFFF
+INITIAL = {"keys": FULL, "counts": 0, "words": FULL, "kinds": FULL, "sums": 0, "runs": 0}
+TABLE = ("kinds", "sums", "runs")
 
 
 class Map:
@@ -21,9 +24,9 @@ class Map:
         params["seed"], params["photon_floor"] = seed, floor
         self.device = device
         self.params = device.upload("params", params)
-        self.keys, self.counts, self.words = (
+        self.keys, self.counts, self.words, self.kinds, self.sums, self.runs = (
             device.upload(name, np.full(CELLS * PLACES, value, np.uint32))
-            for name, value in (("keys", 0xFFFFFFFF), ("counts", 0), ("words", 0xFFFFFFFF))
+            for name, value in INITIAL.items()
         )
 
     def run(self, kernel, inputs, outputs, *names):
@@ -37,6 +40,8 @@ class Map:
         inputs = {"cells": cells, "nodes": nodes, "numbers": numbers}
         self.run("insert_particles", inputs, {}, "keys", "counts")
         self.run("settle_particles", inputs, {}, "keys", "words")
+        rows = {"rows": np.arange(CELLS, dtype=np.uint32)}
+        self.run("tabulate", rows, {}, "words", "counts", *TABLE)
 
     def estimates(self, cells):
         """Return how many particles the map says came to each of ``cells``."""
@@ -48,7 +53,7 @@ class Map:
         return np.where(own, counts[rows], 0).sum(axis=1)
 
     def release(self):
-        self.device.release(self.params, self.keys, self.counts, self.words)
+        self.device.release(self.params, *(getattr(self, name) for name in INITIAL))
 
 
 FEATURES = {"LIGHT_SAMPLING": 3, "TRANSMISSION": 0}
@@ -84,7 +89,7 @@ def test_shares_of_a_cell_sum_to_one_and_follow_its_particles(lane_device):
     asked = np.arange(1 << NODE_BITS, dtype=np.uint32)
     outputs = {"shares": (np.float32, 1), "kept": (np.float32, 1)}
     inputs = {"cells": np.full(len(asked), 77, np.uint32), "nodes": asked}
-    shares, kept = filled.run("list_shares", inputs, outputs, "words", "counts")
+    shares, kept = filled.run("list_shares", inputs, outputs, *TABLE)
     assert shares.sum() == pytest.approx(1.0, abs=1e-5)
     truth = np.bincount(nodes, minlength=len(asked)) / len(nodes)
     # Nodes that share a place lose to one of them; the others are exact.
@@ -93,6 +98,43 @@ def test_shares_of_a_cell_sum_to_one_and_follow_its_particles(lane_device):
     # Hardly a node came only once: the least share is kept for what nobody saw.
     np.testing.assert_allclose(kept, 0.1, atol=0.02)
     empty = {"cells": np.full(len(asked), 78, np.uint32), "nodes": asked}
-    shares, kept = filled.run("list_shares", empty, outputs, "words", "counts")
+    shares, kept = filled.run("list_shares", empty, outputs, *TABLE)
     assert np.all(shares == 0.0) and np.all(kept == 1.0)
+    filled.release()
+
+
+def test_draws_follow_the_counts_of_a_cell_that_shares_its_places(lane_device):
+    """A lattice of numbers draws each as often as the map counts, with the chance it reports."""
+    rng = np.random.default_rng(9)
+    cells = np.where(
+        rng.random(64 * planes.MULTIPLE) < 0.5, 77, rng.integers(0, 2000, 64 * planes.MULTIPLE)
+    )
+    nodes = np.minimum(rng.geometric(0.1, len(cells)), 200)
+    filled = Map(lane_device, 4)
+    filled.insert(cells.astype(np.uint32), nodes.astype(np.uint32))
+    draws = 1 << 14
+    bits = (np.arange(draws, dtype=np.uint64) << 18).astype(np.uint32) + np.uint32(1 << 17)
+    outputs = {"nodes": (np.uint32, 1), "blinds": (np.uint32, 1)}
+    outputs |= {name: (np.float32, 1) for name in ("chances", "kept", "again")}
+    inputs = {"cells": np.full(draws, 77, np.uint32), "bits": bits}
+    drawn, blind, chances, kept, again = filled.run("draw_particles", inputs, outputs, *TABLE)
+    places, prints = filled.run(
+        "list_cells",
+        {"cells": inputs["cells"][:1]},
+        {"places": (np.uint32, 1), "prints": (np.uint32, 1)},
+    )
+    counts, words = (lane_device.read(b).reshape(-1, PLACES) for b in (filled.counts, filled.words))
+    row = places[0] // PLACES
+    assert len(np.unique(words[row][counts[row] > 0] >> NODE_BITS)) > 3
+    own = (words[row] >> NODE_BITS == prints[0]) & (counts[row] > 0)
+    alone, total = (counts[row][own] == 1).sum(), counts[row][own].sum()
+    truth = np.zeros(1 << NODE_BITS)
+    truth[words[row][own] & ((1 << NODE_BITS) - 1)] = counts[row][own] / total
+    seen = blind == 0
+    np.testing.assert_allclose(kept, max(0.1, (alone + 1) / (total + 1)), rtol=1e-6)
+    assert blind.mean() == pytest.approx(kept[0], abs=2 / draws)
+    np.testing.assert_allclose(chances[seen], truth[drawn[seen]], rtol=1e-6)
+    np.testing.assert_array_equal(chances[seen], again[seen])
+    often = np.bincount(drawn[seen], minlength=len(truth)) / seen.sum()
+    np.testing.assert_allclose(often, truth, atol=4 / draws)
     filled.release()

@@ -197,9 +197,9 @@ static inline Float area_light_density(
 #endif
 #if LIGHT_PHOTONS
 #define CHOICE_PARAMETERS                                                                          \
-    TREE_PARAMETERS, __global const uint *light_groups, __global const uint *particle_words,       \
-        __global const uint *particle_counts
-#define CHOICE_ARGUMENTS TREE_ARGUMENTS, light_groups, particle_words, particle_counts
+    TREE_PARAMETERS, __global const uint *light_groups, __global const uint *particle_kinds,       \
+        __global const uint *particle_sums, __global const uint *particle_runs
+#define CHOICE_ARGUMENTS TREE_ARGUMENTS, light_groups, particle_kinds, particle_sums, particle_runs
 #else
 #define CHOICE_PARAMETERS TREE_PARAMETERS
 #define CHOICE_ARGUMENTS TREE_ARGUMENTS
@@ -243,8 +243,8 @@ static inline LightChoice choose_light(
     UInt group;
     Float kept;
     Mask blind;
-    Float share = choose_particle(params, particle_words, particle_counts, active, q->cells, &bits, &group,
-                                  &kept, &blind);
+    Float share = choose_particle(params, particle_kinds, particle_sums, particle_runs, active, q->cells,
+                                  &bits, &group, &kept, &blind);
     const Mask known = kept < 1.0f;
     const Mask seen = active & !blind;
     const UInt pair = pick_u(seen, group >> 1, (UInt)(0u));
@@ -282,8 +282,8 @@ static inline LightChoice choose_light(
     if (any_lane(blind & known)) {
         const UInt its_group = GATHER_WORD(light_groups, choice.light);
         Float unused;
-        const Float its_share = particle_chance(params, particle_words, particle_counts, blind & known,
-                                                q->cells[0], its_group, &unused);
+        const Float its_share = particle_chance(params, particle_kinds, particle_sums, particle_runs,
+                                                blind & known, q->cells[0], its_group, &unused);
         share = pick(blind, its_share, share);
     }
     choice.pmf = pick(known, (1.0f - kept) * share * inside + kept * blindly, blindly);
@@ -320,8 +320,8 @@ static inline Float light_chance(
 #endif
 #if LIGHT_PHOTONS
     Float kept;
-    const Float share = particle_chance(params, particle_words, particle_counts, active, q.cells[0],
-                                        GATHER_WORD(light_groups, wanted), &kept);
+    const Float share = particle_chance(params, particle_kinds, particle_sums, particle_runs, active,
+                                        q.cells[0], GATHER_WORD(light_groups, wanted), &kept);
     return pick(kept < 1.0f, (1.0f - kept) * share * drawn.inside + kept * blindly, blindly);
 #else
     return blindly;

@@ -5,6 +5,9 @@
 // if it came from the cell that is asked for.  Random numbers are a bijection of the particles' numbers:
 // 32 bits both order them and tell them apart.
 //
+// What is asked is a table that is made of the map before the paths start: the words of a cell's places in
+// order, so that those of the same cell make a run, and sums of the particles along each run.
+//
 // Binder, Keller: Ray-Traced Global Illumination for Games, GTC 2019 ("stochastically hashed particle
 // maps"); Hachisuka, Jensen: Parallel Progressive Photon Mapping on GPUs, SIGGRAPH Asia Sketches 2010.
 #pragma once
@@ -83,63 +86,149 @@ static inline UInt particle_place(ParticleCell cell, UInt node)
 ///
 /// Good: The Population Frequencies of Species and the Estimation of Population Parameters, Biometrika
 /// 40, 1953: as likely as particles were the only ones of their kind.
-static inline float chance_of_news(uint total, uint alone) { return (alone + 1.0f) / (total + 1.0f); }
+static inline Float chance_of_news(UInt total, UInt alone)
+{
+    return (to_float(alone) + 1.0f) / (to_float(total) + 1.0f);
+}
 
 // A larger cell is asked where this one's news are as likely as that.
 #define STALE_NEWS 0.1f
 
-/// Chance of `node` among the particles of the cell; `*kept` that of drawing a light whatever they say.
-LARGE_FUNCTION Float particle_chance(
+/// Make the table of a cell's places and of all the cells that share them.
+///
+/// `kinds`: their words in order; `sums`: particles of the run up to there and with it; `runs`: at the first
+/// of a run its length << 8 | how many came alone, else 0.  Where nothing came all stays as it was cleared:
+/// kinds all ones, runs 0.
+static inline void tabulate_cell(
     __global const Params *params,
     __global const uint *words,
     __global const uint *counts,
+    __global uint *kinds,
+    __global uint *sums,
+    __global uint *runs,
+    uint cell)
+{
+    const uint base = cell * PARTICLE_PLACES;
+    const uint node_bits = params->node_bits;
+    uint kind[PARTICLE_PLACES];
+    uint count[PARTICLE_PLACES];
+    uint used = 0;
+    for (uint place = base; place < base + PARTICLE_PLACES; ++place) {
+        if (counts[place] == 0)
+            continue;
+        const uint word = words[place];
+        uint i = used++;
+        for (; i > 0 && kind[i - 1u] > word; --i) {
+            kind[i] = kind[i - 1u];
+            count[i] = count[i - 1u];
+        }
+        kind[i] = word;
+        count[i] = counts[place];
+    }
+    uint i = 0;
+    while (i < used) {
+        const uint first = i;
+        uint sum = 0;
+        uint alone = 0;
+        for (; i < used && kind[i] >> node_bits == kind[first] >> node_bits; ++i) {
+            sum += count[i];
+            alone += count[i] == 1u;
+            kinds[base + i] = kind[i];
+            sums[base + i] = sum;
+            runs[base + i] = 0;
+        }
+        runs[base + first] = (i - first) << 8 | alone;
+    }
+}
+
+/// The particles of a cell in the table, per lane.
+typedef struct {
+    UInt length; // places of its run; 0 where none came
+    UInt total;  // particles
+    Float news;  // how likely the next one is of a new kind
+} ParticleRun;
+
+/// Return how many of the `length` values from `first` on are less than `limit`; they rise.
+static inline UInt count_below(__global const uint *values, UInt first, UInt length, UInt limit)
+{
+    UInt count = 0;
+    for (uint step = PARTICLE_PLACES; step > 0; step >>= 1) {
+        const UInt next = count + step;
+        const Mask inside = next <= length;
+        const UInt value = GATHER_WORD(values, first + pick_u(inside, next - 1u, (UInt)(0u)));
+        count = pick_u(inside & (value < limit), next, count);
+    }
+    return count;
+}
+
+/// Return the cell as choose_particle and particle_chance know it: its place is the first of its run.
+static inline ParticleCell find_run(__global const Params *params, __global const uint *kinds, ParticleCell cell)
+{
+    const UInt before =
+        count_below(kinds, cell.place, (UInt)(PARTICLE_PLACES), cell.print << params->node_bits);
+    cell.place += min(before, (UInt)(PARTICLE_PLACES - 1u));
+    return cell;
+}
+
+/// Return the run of a cell that find_run has returned.
+static inline ParticleRun run_of_cell(
+    __global const Params *params,
+    __global const uint *kinds,
+    __global const uint *sums,
+    __global const uint *runs,
+    ParticleCell cell)
+{
+    const Mask found = GATHER_WORD(kinds, cell.place) >> params->node_bits == cell.print;
+    const UInt both = pick_u(found, GATHER_WORD(runs, cell.place), (UInt)(0u));
+    ParticleRun run;
+    run.length = both >> 8;
+    const Mask known = run.length != 0u;
+    const UInt last = cell.place + pick_u(known, run.length - 1u, (UInt)(0u));
+    run.total = pick_u(known, GATHER_WORD(sums, last), (UInt)(0u));
+    run.news = chance_of_news(run.total, both & 0xffu);
+    return run;
+}
+
+/// Particles of the place `i` of the run that starts at `first`.
+static inline UInt particles_at(__global const uint *sums, UInt first, UInt i)
+{
+    const UInt before = GATHER_WORD(sums, first + pick_u(i > 0u, i - 1u, (UInt)(0u)));
+    return GATHER_WORD(sums, first + i) - pick_u(i > 0u, before, (UInt)(0u));
+}
+
+/// Chance of `node` among the particles of a cell that find_run has returned; `*kept` that of drawing a light
+/// whatever they say.
+LARGE_FUNCTION Float particle_chance(
+    __global const Params *params,
+    __global const uint *kinds,
+    __global const uint *sums,
+    __global const uint *runs,
     Mask active,
     ParticleCell cell,
     UInt node,
     Float *kept)
 {
-    uint lane_place[W];
-    uint lane_print[W];
-    uint lane_node[W];
-    float lane_chance[W];
-    float lane_kept[W];
-    store_lanes_u(cell.place, lane_place);
-    store_lanes_u(cell.print, lane_print);
-    store_lanes_u(node, lane_node);
-    store_lanes((Float)(0.0f), lane_chance);
-    store_lanes((Float)(1.0f), lane_kept);
-    const uint node_bits = params->node_bits;
-    for (uint left = lane_bits(active); left; left &= left - 1u) {
-        const uint k = lowest_bit(left);
-        uint total = 0;
-        uint alone = 0;
-        uint own = 0;
-        const uint wanted = lane_print[k] << node_bits | lane_node[k];
-        for (uint i = 0; i < PARTICLE_PLACES; ++i) {
-            const uint word = words[lane_place[k] + i];
-            const uint count = word >> node_bits == lane_print[k] ? counts[lane_place[k] + i] : 0u;
-            total += count;
-            alone += count == 1u;
-            own += word == wanted ? count : 0u;
-        }
-        if (total == 0)
-            continue;
-        lane_chance[k] = (float)own / (float)total;
-        lane_kept[k] = max(chance_of_news(total, alone), params->photon_floor);
-    }
-    *kept = load_lanes(lane_kept);
-    return load_lanes(lane_chance);
+    cell.place = pick_u(active, cell.place, (UInt)(0u));
+    const ParticleRun run = run_of_cell(params, kinds, sums, runs, cell);
+    const Mask known = active & (run.length != 0u);
+    const UInt word = particle_word(params, cell, node);
+    const UInt before = count_below(kinds, cell.place, run.length, word);
+    const UInt i = pick_u(known & (before < run.length), before, (UInt)(0u));
+    const Mask own = known & (GATHER_WORD(kinds, cell.place + i) == word);
+    *kept = pick(known, max(run.news, params->photon_floor), (Float)(1.0f));
+    return pick(own, to_float(particles_at(sums, cell.place, i)) / to_float(run.total), (Float)(0.0f));
 }
 
 /// Draw the node of one of the particles by their counts, and of 32 random bits whether to draw one.
 ///
-/// `cells`: those of all sizes; the smallest that knows enough answers, and is left in cells[0].
-/// `*kept` as particle_chance has it; `*blind` where a light is to be drawn whatever particles say; `*bits`
-/// is uniform again.
+/// `cells`: those of all sizes; the smallest that knows enough answers, and is left in cells[0] as find_run
+/// returns it.  `*kept` as particle_chance has it; `*blind` where a light is to be drawn whatever particles
+/// say; `*bits` is uniform again.
 LARGE_FUNCTION Float choose_particle(
     __global const Params *params,
-    __global const uint *words,
-    __global const uint *counts,
+    __global const uint *kinds,
+    __global const uint *sums,
+    __global const uint *runs,
     Mask active,
     ParticleCell *cells,
     UInt *bits,
@@ -147,74 +236,42 @@ LARGE_FUNCTION Float choose_particle(
     Float *kept,
     Mask *blind)
 {
-    uint lane_place[PARTICLE_SIZES][W];
-    uint lane_print[PARTICLE_SIZES][W];
-    uint lane_bits_of[W];
-    uint lane_node[W];
-    uint lane_blind[W];
-    float lane_chance[W];
-    float lane_kept[W];
-    for (uint size = 0; size < PARTICLE_SIZES; ++size) {
-        store_lanes_u(cells[size].place, lane_place[size]);
-        store_lanes_u(cells[size].print, lane_print[size]);
+    ParticleCell cell = cells[0];
+    ParticleRun run;
+    run.length = (UInt)(0u);
+    run.total = (UInt)(0u);
+    run.news = (Float)(1.0f);
+    Mask asks = active;
+    for (uint size = 0; size < PARTICLE_SIZES && any_lane(asks); ++size) {
+        const ParticleCell wider = find_run(params, kinds, cells[size]);
+        const ParticleRun found = run_of_cell(params, kinds, sums, runs, wider);
+        cell.place = pick_u(asks, wider.place, cell.place);
+        cell.print = pick_u(asks, wider.print, cell.print);
+        run.length = pick_u(asks, found.length, run.length);
+        run.total = pick_u(asks, found.total, run.total);
+        run.news = pick(asks, found.news, run.news);
+        asks = asks & (found.news >= STALE_NEWS);
     }
-    store_lanes_u(*bits, lane_bits_of);
-    store_lanes_u((UInt)(0u), lane_node);
-    store_lanes_u((UInt)(1u), lane_blind);
-    store_lanes((Float)(0.0f), lane_chance);
-    store_lanes((Float)(1.0f), lane_kept);
-    const uint node_bits = params->node_bits;
-    for (uint left = lane_bits(active); left; left &= left - 1u) {
-        const uint k = lowest_bit(left);
-        uint weight[PARTICLE_PLACES];
-        uint total = 0;
-        float news = 1.0f;
-        __global const uint *word = words;
-        for (uint size = 0; size < PARTICLE_SIZES; ++size) {
-            const uint print = lane_print[size][k];
-            word = words + lane_place[size][k];
-            __global const uint *count = counts + lane_place[size][k];
-            uint alone = 0;
-            total = 0;
-            for (uint i = 0; i < PARTICLE_PLACES; ++i) {
-                weight[i] = word[i] >> node_bits == print ? count[i] : 0u;
-                total += weight[i];
-                alone += weight[i] == 1u;
-            }
-            lane_place[0][k] = lane_place[size][k];
-            lane_print[0][k] = print;
-            news = chance_of_news(total, alone);
-            if (news < STALE_NEWS)
-                break;
-        }
-        if (total == 0)
-            continue;
-        const float blindly = max(news, params->photon_floor);
-        lane_kept[k] = blindly;
-        // What is left of the number is uniform either way; digits that it has run out of are made up.
-        const float u = (float)(lane_bits_of[k] >> 8) * 0x1p-24f;
-        lane_blind[k] = u < blindly;
-        const float rest = u < blindly ? u / blindly : (u - blindly) / (1.0f - blindly);
-        const uint fresh = (uint)(clamp(rest, 0.0f, 0x1.fffffep-1f) * 0x1p32f) ^ (lane_bits_of[k] & 0xffu);
-        lane_bits_of[k] = fresh;
-        if (u < blindly)
-            continue;
-        uint above = mul_hi(fresh, total);
-        uint i = 0;
-        while (i + 1u < PARTICLE_PLACES && above >= weight[i]) {
-            above -= weight[i];
-            ++i;
-        }
-        // Particles of a node all come to one place of a cell.
-        lane_chance[k] = (float)weight[i] / (float)total;
-        lane_node[k] = word[i] & ((1u << node_bits) - 1u);
-        lane_bits_of[k] = (fresh ^ (fresh >> 15)) * 0x2c1b3c6du;
-    }
-    cells[0].place = load_lanes_u(lane_place[0]);
-    cells[0].print = load_lanes_u(lane_print[0]);
-    *bits = load_lanes_u(lane_bits_of);
-    *node = load_lanes_u(lane_node);
-    *blind = active & (load_lanes_u(lane_blind) != 0u);
-    *kept = load_lanes(lane_kept);
-    return load_lanes(lane_chance);
+    cells[0] = cell;
+    const Mask known = active & (run.length != 0u);
+    const Float blindly = max(run.news, params->photon_floor);
+    *kept = pick(known, blindly, (Float)(1.0f));
+    // What is left of the number is uniform either way; digits that it has run out of are made up.
+    const Float u = to_float(*bits >> 8) * 0x1p-24f;
+    const Mask low = u < blindly;
+    const Mask seen = known & !low;
+    *blind = active & !seen;
+    const Float rest = pick(low, u / blindly, (u - blindly) / (1.0f - blindly));
+    const UInt fresh =
+        to_uint(clamp(rest, (Float)(0.0f), (Float)(0x1.fffffep-1f)) * 0x1p32f) ^ (*bits & 0xffu);
+    *bits = pick_u(known, fresh, *bits);
+    *node = (UInt)(0u);
+    if (!any_lane(seen))
+        return (Float)(0.0f);
+    const UInt first = pick_u(seen, cell.place, (UInt)(0u));
+    const UInt above = mul_hi(fresh, run.total);
+    const UInt i = pick_u(seen, count_below(sums, first, run.length, above + 1u), (UInt)(0u));
+    *bits = pick_u(seen, (fresh ^ (fresh >> 15)) * 0x2c1b3c6du, *bits);
+    *node = pick_u(seen, GATHER_WORD(kinds, first + i) & ((1u << params->node_bits) - 1u), (UInt)(0u));
+    return pick(seen, to_float(particles_at(sums, first, i)) / to_float(run.total), (Float)(0.0f));
 }

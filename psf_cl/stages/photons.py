@@ -62,6 +62,7 @@ def plan(context: Context) -> StageSpec | None:
             hash_accesses=1,
         ),
         KernelSpec("settle_photons", reads=("shadow",), record_bytes=8, hash_accesses=1),
+        KernelSpec("tabulate_photons", record_bytes=20),
     )
     return StageSpec(
         "photons",
@@ -86,6 +87,11 @@ def plan(context: Context) -> StageSpec | None:
             BufferSpec("particle_keys", uint32, places, "least random number of each place"),
             BufferSpec("particle_counts", uint32, places, "photons that came to it"),
             BufferSpec("particle_words", uint32, places, "light and cell of the one that stayed"),
+            BufferSpec("particle_kinds", uint32, places, "these in order, as runs of cells"),
+            BufferSpec("particle_sums", uint32, places, "photons of the run up to each"),
+            BufferSpec(
+                "particle_runs", uint32, places, "length of each run, and how many came alone"
+            ),
         ),
         per_pass=True,
         between_passes=True,
@@ -113,17 +119,19 @@ class PhotonMap:
         self.emit = own.bind_planned("emit_photons", buffers, first=0, count=0)
         self.store = own.bind_planned("store_photons", buffers)
         self.settle = own.bind_planned("settle_photons", buffers)
+        self.tabulate = own.bind_planned("tabulate_photons", buffers)
         self.trace = programs["intersect"].bind_planned("intersect_closest", traced)
         self.trace_items = -(-traits.slots // runs_per_trace)
 
     def clear(self) -> None:
         """Forget all photons."""
-        self.device.fill(self.buffers["particle_keys"], 0xFF)
-        for name in ("particle_counts", "particle_words", "photon_counters"):
+        for name in ("particle_keys", "particle_kinds"):
+            self.device.fill(self.buffers[name], 0xFF)
+        for name in ("particle_counts", "particle_words", "particle_runs", "photon_counters"):
             self.device.fill(self.buffers[name])
 
     def add(self, count: int) -> None:
-        """Emit ``count`` photons and enqueue that the map keeps them."""
+        """Emit ``count`` photons and enqueue that the map and its table keep them."""
         first, items = self.drawn(), -(-self.traits.slots // self.traits.lanes)
         for start in range(0, count, self.traits.slots):
             batch = min(count - start, self.traits.slots)
@@ -133,6 +141,7 @@ class PhotonMap:
             launches: tuple[Launch, ...] = (self.store, self.settle)
             for launch in launches:
                 launch(items)
+        self.tabulate(CELLS)
 
     def counts(self) -> dict[str, int]:
         """Return what became of the photons so far, by the names of ``layout.PHOTON_COUNTERS``."""

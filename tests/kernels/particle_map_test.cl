@@ -42,20 +42,64 @@ kernel void settle_particles(
             words[lane_place[k]] = lane_word[k];
 }
 
-/// Share of the particles of a cell that are from below a node.
-kernel void list_shares(
+/// The table of each cell's places: one work item W of those in `rows`.
+kernel void tabulate(
     global const Params *params,
     global const uint *words,
     global const uint *counts,
+    global uint *kinds,
+    global uint *sums,
+    global uint *runs,
+    global const uint *rows)
+{
+    for (uint k = 0; k < W; ++k)
+        tabulate_cell(params, words, counts, kinds, sums, runs, rows[get_global_id(0) * W + k]);
+}
+
+/// Share of the particles of a cell that are from below a node.
+kernel void list_shares(
+    global const Params *params,
+    global const uint *kinds,
+    global const uint *sums,
+    global const uint *runs,
     global const uint *cells,
     global const uint *nodes,
     global float *shares,
     global float *kept)
 {
     Float rest;
-    const ParticleCell cell = cell_of_hash(params, mix_bits(LOAD_U(cells, 0)));
-    STORE(shares, 0, particle_chance(params, words, counts, MASK_ALL, cell, LOAD_U(nodes, 0), &rest));
+    const ParticleCell cell = find_run(params, kinds, cell_of_hash(params, mix_bits(LOAD_U(cells, 0))));
+    STORE(shares, 0, particle_chance(params, kinds, sums, runs, MASK_ALL, cell, LOAD_U(nodes, 0), &rest));
     STORE(kept, 0, rest);
+}
+
+/// A draw of `bits`: what is kept, whether it is blind, and of the others the node and its chance.
+kernel void draw_particles(
+    global const Params *params,
+    global const uint *kinds,
+    global const uint *sums,
+    global const uint *runs,
+    global const uint *cells,
+    global const uint *bits,
+    global uint *nodes,
+    global uint *blinds,
+    global float *chances,
+    global float *kept,
+    global float *again)
+{
+    const ParticleCell cell = cell_of_hash(params, mix_bits(LOAD_U(cells, 0)));
+    ParticleCell sizes[PARTICLE_SIZES];
+    for (uint size = 0; size < PARTICLE_SIZES; ++size)
+        sizes[size] = cell;
+    UInt random = LOAD_U(bits, 0);
+    UInt node;
+    Float rest;
+    Mask blind;
+    STORE(chances, 0, choose_particle(params, kinds, sums, runs, MASK_ALL, sizes, &random, &node, &rest, &blind));
+    STORE(kept, 0, rest);
+    STORE_U(nodes, 0, node);
+    STORE_U(blinds, 0, pick_u(blind, (UInt)(1u), (UInt)(0u)));
+    STORE(again, 0, particle_chance(params, kinds, sums, runs, MASK_ALL, sizes[0], node, &rest));
 }
 
 /// The first place of each cell, and what tells its particles from others.
