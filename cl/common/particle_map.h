@@ -97,7 +97,8 @@ static inline Float chance_of_news(UInt total, UInt alone)
 /// Make the table of a cell's places and of all the cells that share them.
 ///
 /// `kinds`: their words in order; `sums`: particles of the run up to there and with it; `runs`: at the first
-/// of a run its length << 8 | how many came alone, else 0.  Where nothing came all stays as it was cleared:
+/// of a run its length << 8 | how many came alone, else 0; at the first place of all, too, << 16 how many are
+/// in use, for a search that reads no more than these.  Where nothing came all stays as it was cleared:
 /// kinds all ones, runs 0.
 static inline void tabulate_cell(
     __global const Params *params,
@@ -137,7 +138,7 @@ static inline void tabulate_cell(
             sums[base + i] = sum;
             runs[base + i] = 0;
         }
-        runs[base + first] = (i - first) << 8 | alone;
+        runs[base + first] = (i - first) << 8 | alone | (first == 0 ? used << 16 : 0u);
     }
 }
 
@@ -155,6 +156,8 @@ static inline UInt count_below(__global const uint *values, UInt first, UInt len
     for (uint step = PARTICLE_PLACES; step > 0; step >>= 1) {
         const UInt next = count + step;
         const Mask inside = next <= length;
+        if (!any_lane(inside))
+            continue;
         const UInt value = GATHER_WORD(values, first + pick_u(inside, next - 1u, (UInt)(0u)));
         count = pick_u(inside & (value < limit), next, count);
     }
@@ -162,10 +165,11 @@ static inline UInt count_below(__global const uint *values, UInt first, UInt len
 }
 
 /// Return the cell as choose_particle and particle_chance know it: its place is the first of its run.
-static inline ParticleCell find_run(__global const Params *params, __global const uint *kinds, ParticleCell cell)
+static inline ParticleCell find_run(
+    __global const Params *params, __global const uint *kinds, __global const uint *runs, ParticleCell cell)
 {
-    const UInt before =
-        count_below(kinds, cell.place, (UInt)(PARTICLE_PLACES), cell.print << params->node_bits);
+    const UInt used = GATHER_WORD(runs, cell.place) >> 16;
+    const UInt before = count_below(kinds, cell.place, used, cell.print << params->node_bits);
     cell.place += min(before, (UInt)(PARTICLE_PLACES - 1u));
     return cell;
 }
@@ -181,7 +185,7 @@ static inline ParticleRun run_of_cell(
     const Mask found = GATHER_WORD(kinds, cell.place) >> params->node_bits == cell.print;
     const UInt both = pick_u(found, GATHER_WORD(runs, cell.place), (UInt)(0u));
     ParticleRun run;
-    run.length = both >> 8;
+    run.length = both >> 8 & 0xffu;
     const Mask known = run.length != 0u;
     const UInt last = cell.place + pick_u(known, run.length - 1u, (UInt)(0u));
     run.total = pick_u(known, GATHER_WORD(sums, last), (UInt)(0u));
@@ -243,7 +247,7 @@ LARGE_FUNCTION Float choose_particle(
     run.news = (Float)(1.0f);
     Mask asks = active;
     for (uint size = 0; size < PARTICLE_SIZES && any_lane(asks); ++size) {
-        const ParticleCell wider = find_run(params, kinds, cells[size]);
+        const ParticleCell wider = find_run(params, kinds, runs, cells[size]);
         const ParticleRun found = run_of_cell(params, kinds, sums, runs, wider);
         cell.place = pick_u(asks, wider.place, cell.place);
         cell.print = pick_u(asks, wider.print, cell.print);

@@ -68,7 +68,7 @@ kernel void list_shares(
     global float *kept)
 {
     Float rest;
-    const ParticleCell cell = find_run(params, kinds, cell_of_hash(params, mix_bits(LOAD_U(cells, 0))));
+    const ParticleCell cell = find_run(params, kinds, runs, cell_of_hash(params, mix_bits(LOAD_U(cells, 0))));
     STORE(shares, 0, particle_chance(params, kinds, sums, runs, MASK_ALL, cell, LOAD_U(nodes, 0), &rest));
     STORE(kept, 0, rest);
 }
