@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+from scene_builder import build, camera
 
 from psf_cl.device import layout
 from psf_cl.device.program import load_program
+from psf_cl.plan import make_plan
+from psf_cl.settings import Settings
 
 AT = layout.COUNTER_INDEX
 
@@ -142,11 +145,9 @@ def hand_in(device, radiance, direct):
         "samples": device.allocate("samples", np.float32, count * 4),
         "direct": device.allocate("direct", np.float32, count * 4),
     }
-    flags = (
-        "TEXTURES ALPHA SMOOTH TRANSMISSION AREA_LIGHTS PUNCTUAL_LIGHTS ENVIRONMENT CONNECT LENS"
-        " AOV_FEATURES FEW GLOSSY VERTEX_COLORS TANGENTS LAYERS CELLS"
-    ).split()
-    program = load_program(device, "camera.cl", dict.fromkeys(flags, 0) | {"AOV_DIRECT": 1})
+    features = make_plan(build([], camera((0, 0, 1), (0, 0, 0), 40)), Settings()).features
+    flags = dict.fromkeys(features, 0) | {"AOV_DIRECT": 1}
+    program = load_program(device, "camera.cl", flags)
     program.bind("regenerate_paths", **buffers)(traits.slots // traits.lanes)
     rings = [device.read(buffers[name]).reshape(count, 4) for name in ("samples", "direct")]
     counters = device.read(buffers["counters"])

@@ -12,6 +12,7 @@ import pytest
 from scene_builder import build, camera, dented_bowl, floor, glowing, lambertian
 
 from psf_cl import instancing
+from psf_cl.device import layout
 from psf_cl.plan import make_plan
 from psf_cl.renderer import Renderer
 from psf_cl.scene import primitives, transform
@@ -168,7 +169,7 @@ def test_memory_grows_with_meshes_not_with_instances():
     grown = {name: more[name] - few[name] for name in more}
     instances = grown.pop("instances")
     assert not any(grown.values())
-    assert instances == 80 * 128
+    assert instances == 80 * layout.INSTANCE.dtype.itemsize
 
 
 def test_a_scene_without_reuse_has_one_level():

@@ -87,6 +87,8 @@ def _fans(data: bytes, at: int, count: int, properties: list[list[str]], order: 
         for length, kind in kinds:
             size = 1
             if length is not None:
+                if length.kind == "f":
+                    raise ValueError("a number of corners is no integer")
                 size = int(np.frombuffer(data, length, 1, at)[0])
                 at += length.itemsize
             if size < 0 or at + size * kind.itemsize > len(data):
