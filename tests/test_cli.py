@@ -97,6 +97,9 @@ class FakeRenderer:
             "settings": {},
         }
 
+    def settle(self):
+        pass
+
     def close(self):
         self.closed = True
 
@@ -484,8 +487,13 @@ def test_plan_follows_the_options(all_features, capsys):
         "LAYERS",
         "LIGHT_SAMPLING",
         "METROPOLIS",
+        "MOTION",
+        "RESTORE",
+        "SEEN",
+        "TANGENTS",
+        "TEMPORAL",
+        "VERTEX_COLORS",
     }
-    unused |= {"SEEN", "TANGENTS", "VERTEX_COLORS"}
     off_by_default = unused | {"AOV_DIRECT", "AOV_FEATURES"}
     assert off == off_by_default and plan["crop"] == [0, 0, 24, 16]
     plan, off = features("--camera above --aov direct --crop 1,2,3,4")
