@@ -273,6 +273,9 @@ def test_kernels_declare_the_fields_of_a_path_that_their_sources_use():
             # It has no paths, but sees the macro for the seeds of theirs.
             assert reads == {"seed", "sample"}
             reads = set()
+        if stage.name == "photons":
+            # Photons write the seed themselves, and see that macro too.
+            reads.remove("seed")
         declared = [set(), set()]
         for kernel in stage.kernels:
             declared[0].update(path_fields(*kernel.reads))

@@ -958,10 +958,10 @@ def path_fields(*names: str) -> tuple[str, ...]:
         ValueError: there is no such field.
     """
     found = []
+    every = all_path_fields()
     for name in names:
-        matching = [
-            known for known in all_path_fields() if name in (known, known.rpartition("_")[0])
-        ]
+        matching = [name] if name in every else []
+        matching = matching or [known for known in every if known.rpartition("_")[0] == name]
         if not matching:
             raise ValueError(f"{name}: no such field of a path")
         found += matching

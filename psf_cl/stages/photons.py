@@ -56,12 +56,12 @@ def plan(context: Context) -> StageSpec | None:
         ),
         KernelSpec(
             "store_photons",
-            reads=("status", "direction", "hit", "sample", "pixel"),
-            writes=("shadow", "status"),
+            reads=("status", "direction", "hit_triangle", "hit_u", "hit_v", "sample", "pixel"),
+            writes=("shadow_z", "status"),
             record_bytes=layout.SURFACE.dtype.itemsize + 8,
             hash_accesses=1,
         ),
-        KernelSpec("settle_photons", reads=("shadow",), record_bytes=8, hash_accesses=1),
+        KernelSpec("settle_photons", reads=("shadow_z",), record_bytes=8, hash_accesses=1),
         KernelSpec("tabulate_photons", record_bytes=20),
     )
     return StageSpec(

@@ -66,7 +66,9 @@ def _kernel(context: Context) -> KernelSpec:
         shadow += ("light_share",)
     if context.features["BASE"].value == 2 and shadow:
         shadow += ("base_light",)
-    chosen = ("light_normal",) if context.on("LIGHT_SAMPLING") else ()
+    chosen: tuple[str, ...] = ("light_normal",) if context.on("LIGHT_SAMPLING") else ()
+    if context.features["LIGHT_SAMPLING"].value >= 2:
+        chosen += ("particle_place", "particle_print")
     guided = ("guide", "expected") if context.on("GUIDE") else ()
     if guided and shadow:
         shadow += ("guide_from", "guide_light")
@@ -98,7 +100,7 @@ def _kernel(context: Context) -> KernelSpec:
     feature_bytes = 3 * 16 if context.on("AOV_FEATURES") else 0
     return KernelSpec(
         "shade_paths",
-        reads=(*walk, "hit", "sample", "pixel", "seed"),
+        reads=(*walk, *(("origin",) if chosen else ()), "hit", "sample", "pixel", "seed"),
         writes=(*walk, "origin", *shadow),
         record_bytes=sum(record.dtype.itemsize for record in records) + feature_bytes + guide_bytes,
         hash_accesses=int(context.on("GUIDE")),
