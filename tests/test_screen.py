@@ -207,7 +207,7 @@ def test_a_rendered_texture_under_an_even_sky_stays_as_it_is(device):
     np.testing.assert_allclose(image.rgb, plain.rgb, rtol=1e-5)
 
 
-@pytest.mark.parametrize("matt", [True, False])
+@pytest.mark.parametrize("matt", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_filter_of_no_width_changes_no_bit(device, matt):
     plain = render(device, room(matt=matt), 4)
     image = render(device, room(matt=matt), 4, **FILTER, screen_radius=0.0)
