@@ -37,6 +37,9 @@ OFFSET_EPSILON = 2.0**-20
 #: infinitely far: its flux through the scene says little about how much of it comes in.
 NEAR_SHARE = 0.5
 
+#: Of a light, in its record: more is no float32.
+MOST_POWER = 1e38
+
 
 #: The camera of the frame before, in layout.PARAMS, and what it is made of.
 PREVIOUS_CAMERA = {
@@ -470,10 +473,8 @@ def light_table(scene: Scene, geometry: Geometry, sampling: str) -> np.ndarray:
             geometry.surfaces["e2"][triangles].astype(np.float64),
         )
         area = 0.5 * np.linalg.norm(cross, axis=1)
-    # float32 tells the areas of these on the device; smaller ones have none there.
-    sound = (
-        np.isfinite(area) & (area > 1e-30) & np.isfinite(geometry.positions[triangles]).all(axis=1)
-    )
+    # float32 tells the areas of these on the device; smaller and larger ones have none there.
+    sound = (area > 1e-30) & (area < 1e30) & np.isfinite(geometry.positions[triangles]).all(axis=1)
     if scene.nodes:
         # What moves keeps its place in the table, though it gives no light while it has no area.
         area = np.where(sound, area, 0.0)
@@ -494,7 +495,9 @@ def light_table(scene: Scene, geometry: Geometry, sampling: str) -> np.ndarray:
     power[: len(triangles)] = area * radiance[of] * sided[of] * math.pi
     # A texture may be black on average and still glow somewhere.
     power[: len(triangles)] = np.maximum(power[: len(triangles)], power.max(initial=0.0) * 1e-6)
-    table["power"][: len(triangles)] = power[: len(triangles)] / (sided[of] * math.pi)
+    table["power"][: len(triangles)] = np.minimum(
+        power[: len(triangles)] / (sided[of] * math.pi), MOST_POWER
+    )
 
     at = len(triangles)
     radius = max(geometry.radius, 1e-30)

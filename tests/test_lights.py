@@ -599,6 +599,16 @@ def test_chances_of_lights_are_the_chances_of_their_table():
     np.testing.assert_allclose(cells["pmf"], exact, rtol=1e-6)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("size", "count"), [(1e14, 4), (1e17, 0)], ids=["huge", "beyond float32"])
+def test_lights_of_areas_that_float32_does_not_tell_are_no_lights(size, count):
+    glow = Material(emission=(1e20, 1e20, 1e20))
+    scene = triangles_scene(CORNERS * size, [glow], [0] * len(CORNERS))
+    lights = tables.light_table(scene, tables.flatten(scene), "power")
+    assert len(lights) == count
+    assert all(np.isfinite(lights[name]).all() for name in ("area", "power", "pmf"))
+
+
 def test_power_is_what_the_formulas_say():
     area, _ = areas_and_normals(CORNERS)
     lights = (
