@@ -275,7 +275,7 @@ def shiny(size=(48, 32)):
     )
 
 
-@pytest.mark.parametrize("vertex", ["1", "2", "auto"])
+@pytest.mark.parametrize("vertex", ["1", pytest.param("2", marks=pytest.mark.slow), "auto"])
 @pytest.mark.parametrize("direct", [True, False])
 def test_only_what_the_base_reflects_is_shared_and_all_of_it_arrives(device, vertex, direct):
     expected = render(device, shiny(), 8).rgb

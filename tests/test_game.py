@@ -13,11 +13,11 @@ from scene_builder import (
     inside_out,
     lambertian,
     render,
-    renderer,
 )
 
+from psf_cl.plan import make_plan
 from psf_cl.scene import primitives, transform
-from psf_cl.settings import preset_values
+from psf_cl.settings import Settings, preset_values
 
 
 @pytest.fixture(scope="module")
@@ -36,13 +36,12 @@ def scene():
     )
 
 
-def test_game_has_a_stage_for_each_technique(device, scene):
-    opened = renderer(device, scene, **preset_values("game"))
-    stages = {stage.name for stage in opened.plan.stages}
-    opened.close()
+def test_game_has_a_stage_for_each_technique(scene):
+    stages = {stage.name for stage in make_plan(scene, Settings(**preset_values("game"))).stages}
     assert stages >= {"photons", "guide", "cells", "temporal", "screen"}
 
 
+@pytest.mark.slow
 def test_together_they_are_as_bright_as_plain_path_tracing(device, scene):
     """Cells blur, but neither darken nor brighten; the screen filter blurs shadows in addition."""
     truth = render(device, scene, 1024).rgb

@@ -232,7 +232,7 @@ def many_kinds():
     return build(parts, view, (16, 16), lights=lights, environment=0.3)
 
 
-@pytest.mark.parametrize("sampling", ["mis", "light"])
+@pytest.mark.parametrize("sampling", ["mis", pytest.param("light", marks=pytest.mark.slow)])
 def test_image_is_the_same_as_with_a_table(device, sampling):
     scene = many_kinds()
     common = {"sampler": "random", "max_depth": 3, "direct_sampling": sampling}

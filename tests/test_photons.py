@@ -80,7 +80,7 @@ def test_the_same_photons_leave_the_same_map_and_the_same_image(device, opened):
 
 
 @pytest.mark.parametrize("over", ["hierarchy", pytest.param("power", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("sampling", ["mis", "light"])
+@pytest.mark.parametrize("sampling", ["mis", pytest.param("light", marks=pytest.mark.slow)])
 def test_image_is_the_same_as_with_a_table(device, sampling, over):
     scene = many_kinds()
     common = {"sampler": "random", "max_depth": 3, "direct_sampling": sampling}
