@@ -1,4 +1,4 @@
-"""Run every kernel in Oclgrind: ``python tools/check_kernels.py [--presets a,b] [--lanes 1,16]``.
+"""Run presets in Oclgrind: ``python tools/check_kernels.py [--presets a,b] [--lanes 1,16]``.
 
 Oclgrind is a simulator of OpenCL devices (Debian's package ``oclgrind``): it reports every access
 outside of a buffer, data races between work items, and barriers that not all of a group reach.  It
