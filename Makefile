@@ -23,8 +23,9 @@ render: setup
 	@mkdir -p "$(dir $(OUT))"
 	@$(RUN) psf_cl render "$(SCENE)" -o "$(OUT)" $(ARGS)
 
+# Two processes: most of the time goes into compiling kernels, which one thread of a driver does.
 test: setup
-	@$(RUN) pytest $(ARGS)
+	@$(RUN) pytest -n 2 --dist loadfile $(ARGS)
 
 test-slow: setup
 	@$(RUN) pytest -m slow $(ARGS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import itertools
+import re
 import time
 from pathlib import Path
 
@@ -158,3 +159,11 @@ def _brute_force(corners: np.ndarray, origins: np.ndarray, directions: np.ndarra
         t = (e2 * other).sum(-1) * scale
         hit = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0)
     return np.where(hit, t, np.inf).min(axis=1)
+
+
+def test_what_statistics_cost_is_told_with_an_interval(capsys):
+    tool = importlib.import_module("statistics_cost")
+    scene = str(ROOT / "scenes" / "cornell_box.toml")
+    assert tool.main([scene, "--size", "16x16", "--spp", "1", "--rounds", "3"]) == 0
+    median, low, high = map(float, re.findall(r"\d+\.\d{4}", capsys.readouterr().out))
+    assert 0.0 < low <= median <= high
