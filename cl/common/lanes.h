@@ -172,6 +172,35 @@ static inline Float gather_words(__global const float *words, UInt at) { return 
 #define GATHER_WORD(array, index) as_bits(gather_words((__global const float *)(array), index))
 #endif
 
+#ifdef CHECK_INDICES
+// Only in checked sources (`index_checks.py`).
+#if W == 1
+#undef GATHER
+#undef GATHER_U
+#undef GATHER_WORD
+#define GATHER(array, index, member) ((array)[AT(array, index)].member)
+#define GATHER_U(array, index, member) GATHER(array, index, member)
+#define GATHER_WORD(array, index) ((array)[AT(array, index)])
+#define gather_words(words, at) ((words)[AT(words, at)])
+#else
+static inline UInt indices_checked(__global const void *array, UInt index, uint size, uint site)
+{
+    uint lane[W];
+    store_lanes_u(index, lane);
+    for (uint k = 0; k < W; ++k)
+        lane[k] = (uint)index_checked(array, lane[k], 1u, size, site);
+    return load_lanes_u(lane);
+}
+static inline Float gather_unchecked(__global const float *words, UInt at) { return gather_words(words, at); }
+#define LANES_AT(array, index) \
+    indices_checked((__global const void *)(array), index, (uint)sizeof(*(array)), SITE)
+#undef GATHER
+#define GATHER(array, index, member)                                                               \
+    gather_unchecked((__global const float *)&(array)->member, LANES_AT(array, index) * WORDS_OF(array))
+#define gather_words(words, at) gather_unchecked(words, LANES_AT(words, at))
+#endif
+#endif
+
 /// Index of the lowest set bit; `bits` is not 0.
 static inline uint lowest_bit(uint bits) { return popcount((bits - 1u) & ~bits); }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import weakref
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyopencl as cl
 
+from psf_cl.device.index_checks import HEADER_WORDS, header_of, violation_in
 from psf_cl.device.selftest import run_self_test
 from psf_cl.errors import DeviceError, InputError, NoRoomError
 from psf_cl.measure.timing import TRANSFER, Interval, Spent
@@ -21,7 +23,8 @@ if TYPE_CHECKING:
     from psf_cl.device.program import Program
 
 
-#: Environment variable: 1 puts bytes behind every buffer that no kernel may change.
+#: Environment variable: 1 puts bytes behind every buffer that no kernel may change, and has kernels
+#: check the indices of what they access.
 GUARD_VARIABLE = "PSF_CL_GUARDS"
 _GUARD_BYTES = 4096
 # As a float it is not a number: reading behind an end shows in the image.
@@ -69,7 +72,11 @@ class Device:
         self.profiling = profiling
         flags = cl.command_queue_properties.PROFILING_ENABLE if profiling else 0
         self.queue = cl.CommandQueue(self.context, properties=flags)
+        # 0: no guards, and sources as they are.
         self.guard_bytes = _GUARD_BYTES if os.environ.get(GUARD_VARIABLE) == "1" else 0
+        # Of checked sources, by number.
+        self.site_files: dict[int, str] = {}
+        self.checked: weakref.WeakSet[Buffer] = weakref.WeakSet()
         self.allocated_bytes = 0
         self.peak_bytes = 0
         self.programs: dict[tuple[Any, ...], Program] = {}
@@ -111,7 +118,7 @@ class Device:
             )
         try:
             with self.failures(f"allocating {size / 2**20:.0f} MiB for {name}"):
-                memory = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, size + self.guard_bytes)
+                memory = self.memory(size)
                 # A pattern of one byte divides every size.
                 event = cl.enqueue_fill_buffer(self.queue, memory, np.uint8(0), 0, size)
                 if self.guard_bytes:
@@ -123,7 +130,29 @@ class Device:
         self.note_event(TRANSFER, f"clear {name}", size, event)
         self.allocated_bytes += size
         self.peak_bytes = max(self.peak_bytes, self.allocated_bytes)
-        return Buffer(name, dtype, count, memory)
+        buffer = Buffer(name, dtype, count, memory)
+        if self.guard_bytes:
+            self.checked.add(buffer)
+        return buffer
+
+    def memory(self, size: int) -> cl.Buffer:
+        """Return memory of ``size`` bytes; guarded, it has a header before it and more behind it.
+
+        Raises:
+            cl.Error: the driver has none.
+        """
+        flags = cl.mem_flags.READ_WRITE
+        if not self.guard_bytes:
+            return cl.Buffer(self.context, flags, size)
+        origin = self._header_bytes
+        whole = cl.Buffer(self.context, flags, origin + size + self.guard_bytes)
+        header = header_of(size)
+        cl.enqueue_copy(self.queue, whole, header, dst_offset=origin - header.nbytes)
+        return whole.get_sub_region(origin, size + self.guard_bytes, flags)
+
+    @property
+    def _header_bytes(self) -> int:
+        return max(self.cl_device.mem_base_addr_align // 8, 4 * HEADER_WORDS)
 
     def upload(self, name: str, array: np.ndarray) -> Buffer:
         """Return a buffer that holds a copy of ``array`` (flattened)."""
@@ -159,6 +188,7 @@ class Device:
                     self.queue, array, buffer.memory, src_offset=offset * buffer.dtype.itemsize
                 )
             self.note_event(TRANSFER, f"read {buffer.name}", array.nbytes, event)
+        self.check_indices(*self.checked)
         return array
 
     def fill(self, buffer: Buffer, byte: int = 0) -> None:
@@ -173,14 +203,41 @@ class Device:
         """Give buffers back; using one afterwards is an error.
 
         Raises:
-            DeviceError: guards are on, and what lies behind a buffer was changed.
+            DeviceError: guards are on, and what lies behind a buffer was changed, or a kernel
+                wanted an item that it does not have.
         """
         broken = [buffer.name for buffer in buffers if not self._guard_is_whole(buffer)]
-        for buffer in buffers:
-            self.allocated_bytes -= buffer.bytes
-            buffer.release()
+        try:
+            self.check_indices(*buffers)
+        finally:
+            for buffer in buffers:
+                self.allocated_bytes -= buffer.bytes
+                self.checked.discard(buffer)
+                buffer.release()
         if broken:
             raise DeviceError(f"a kernel wrote behind the end of {', '.join(broken)}")
+
+    def check_indices(self, *buffers: Buffer) -> None:
+        """Look for indices that were too large, as kernels noted them if guards are on.
+
+        Raises:
+            DeviceError: there was one.
+        """
+        if not self.guard_bytes:
+            return
+        for buffer in buffers:
+            header = np.empty(HEADER_WORDS, np.uint32)
+            start = self._header_bytes - header.nbytes
+            with self.failures(f"reading the header of {buffer.name}"):
+                whole = buffer.memory.associated_memobject
+                cl.enqueue_copy(self.queue, header, whole, src_offset=start)
+            found = violation_in(header)
+            if found is not None:
+                file, line = self.site_files.get(found.site >> 16), found.site & 0xFFFF
+                raise DeviceError(
+                    f"a kernel wanted item {found.index} of {found.size} bytes of {buffer.name}, "
+                    f"which has {buffer.bytes} bytes, at {file}:{line}; {found.count} such accesses"
+                )
 
     def _guard_is_whole(self, buffer: Buffer) -> bool:
         if not self.guard_bytes:

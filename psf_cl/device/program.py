@@ -12,6 +12,7 @@ import numpy as np
 import pyopencl as cl
 
 from psf_cl.device.device import Buffer, Device
+from psf_cl.device.index_checks import checked_source
 from psf_cl.device.layout import RECORDS
 from psf_cl.device.sources import kernel_folder
 from psf_cl.errors import DeviceError
@@ -88,6 +89,9 @@ class Program:
             *(f"-D{name}={value}" for name, value in sorted(defines.items())),
         ]
         source = assemble(file, folder)
+        if device.guard_bytes:
+            source, files = checked_source(source)
+            device.site_files |= files
         start = time.perf_counter()
         try:
             self.program = cl.Program(device.context, source).build(options=options)
@@ -105,7 +109,7 @@ class Program:
         start = time.perf_counter()
         with device.failures(f"warming up {self.file}"):
             queue = cl.CommandQueue(device.context)
-            zeros = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, _WARM_UP_BYTES)
+            zeros = device.memory(_WARM_UP_BYTES)
             cl.enqueue_fill_buffer(queue, zeros, np.uint8(0), 0, _WARM_UP_BYTES)
             for name in kernels:
                 kernel = cl.Kernel(self.program, name)
