@@ -23,7 +23,7 @@ static inline uint connect_paths(
     const Mask wanted = !(light.x + light.y + light.z <= 0.0f);
     if (!any_lane(wanted))
         return 0;
-    DEFINE_RAY_SEEDS(path, (get_u(path, PATH_STATUS) & DEPTH_MASK) * 2u + 1u);
+    DEFINE_RAY_TRAITS(path, (get_u(path, PATH_STATUS) & DEPTH_MASK) * 2u + 1u);
     const Mask blocked = blocked_rays(params, wanted, get_v(path, PATH_SHADOW_X), get_v(path, PATH_TOWARD_X),
                                       GEOMETRY_ARGUMENTS);
     const Vec3 zero = vec3_all((Float)(0.0f));

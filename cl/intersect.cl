@@ -13,7 +13,7 @@ static inline uint trace_paths(__global const Params *params, __global Float *pa
     const Mask alive = (status & STATUS_MASK) == STATUS_ALIVE;
     if (!any_lane(alive))
         return 0;
-    DEFINE_RAY_SEEDS(path, (status & DEPTH_MASK) * 2u);
+    DEFINE_RAY_TRAITS(path, (status & DEPTH_MASK) * 2u);
     const Hits hits = closest_hits(params, alive, get_v(path, PATH_ORIGIN_X), get_v(path, PATH_DIRECTION_X),
                                    GEOMETRY_ARGUMENTS);
     put_u(path, PATH_HIT_TRIANGLE, hits.triangle);

@@ -68,7 +68,7 @@ kernel void emit_photons(
     put_u(path, PATH_SAMPLE, number);
     put_u(path, PATH_PIXEL, e.light);
     put_u(path, PATH_TOWARD_X, e.point);
-    put_u(path, PATH_STATUS, pick_u(starts, (UInt)(STATUS_ALIVE), (UInt)(STATUS_DONE)));
+    put_u(path, PATH_STATUS, pick_u(starts, (UInt)(STATUS_ALIVE | 1u), (UInt)(STATUS_DONE)));
     count_photons(photon_counters, PHOTONS_EMITTED, starts);
     count_photons(photon_counters, PHOTONS_DARK, dark);
     count_photons(photon_counters, PHOTONS_REJECTED, broken);

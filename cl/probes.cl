@@ -36,15 +36,22 @@
 #define LAST_SKY
 #endif
 #if ALPHA == 2
-#define SEEDS_PARAMETER , const uint *ray_seeds
-#define SEEDS_ARGUMENT , ray_seeds
 #define DEFINE_PROBE_SEEDS(seed)                                                                   \
     uint ray_seeds[W];                                                                             \
-    store_lanes_u(seed, ray_seeds)
+    store_lanes_u(seed, ray_seeds);
 #else
-#define SEEDS_PARAMETER
-#define SEEDS_ARGUMENT
 #define DEFINE_PROBE_SEEDS(seed)
+#endif
+// `whose`: 1 for the camera's rays, 0 for all others.
+#if BACK_FACES
+#define DEFINE_PROBE_RAYS(seed, whose)                                                             \
+    DEFINE_PROBE_SEEDS(seed)                                                                       \
+    uint camera_rays[W];                                                                           \
+    SET_PROBE_RAYS(whose)
+#define SET_PROBE_RAYS(whose) store_lanes_u((UInt)(whose), camera_rays)
+#else
+#define DEFINE_PROBE_RAYS(seed, whose) DEFINE_PROBE_SEEDS(seed)
+#define SET_PROBE_RAYS(whose)
 #endif
 #define SCENE_PARAMETERS                                                                           \
     __global const Params *params, TRIANGLE_BUFFERS, __global const Surface *surfaces NORMAL_PARAMETERS, \
@@ -55,7 +62,7 @@ static inline Float luminance_of(Vec3 c) { return 0.2126f * c.x + 0.7152f * c.y 
 
 /// Light of the chosen light that a white surface at `s` reflects, as luminance; 0 outside of `mask`.
 LARGE_FUNCTION Float reflected_light(
-    SCENE_PARAMETERS SEEDS_PARAMETER, Mask mask, SurfacePoint s, LightChoice choice, UInt seed)
+    SCENE_PARAMETERS RAY_PARAMETERS, Mask mask, SurfacePoint s, LightChoice choice, UInt seed)
 {
     const Vec3 above = add_scaled(s.p, s.ng, s.offset);
     const LightSample light = sample_light(params, lights, surfaces, materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS,
@@ -86,7 +93,7 @@ kernel void measure_probes(SCENE_PARAMETERS, __global Probe *probes)
     const UInt triangle = GATHER_U(probes, at, triangle);
     const Mask there = triangle != NO_HIT;
     const UInt seed = GATHER_U(probes, at, seed);
-    DEFINE_PROBE_SEEDS(seed);
+    DEFINE_PROBE_RAYS(seed, 0u);
     const Vec3 wo = vec3(GATHER(probes, at, wo[0]), GATHER(probes, at, wo[1]), GATHER(probes, at, wo[2]));
     const SurfacePoint s = surface_point(pick_u(there, triangle, (UInt)(0u)), GATHER(probes, at, u),
                                          GATHER(probes, at, v), wo, surfaces NORMAL_ARGUMENTS INSTANCE_ARGUMENTS);
@@ -94,7 +101,7 @@ kernel void measure_probes(SCENE_PARAMETERS, __global Probe *probes)
     choice.light = GATHER_U(probes, at, light);
     choice.pmf = GATHER(probes, at, pmf);
     Float value = reflected_light(params, TRIANGLE_ARGUMENTS, surfaces NORMAL_ARGUMENTS,
-                                  materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS, lights LAST_SKY SEEDS_ARGUMENT,
+                                  materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS, lights LAST_SKY RAY_ARGUMENTS,
                                   there, s, choice, seed);
     const Mask shines = there & (s.front | ((GATHER_U(materials, s.material, flags) & MATERIAL_TWO_SIDED_EMISSION) != 0u));
     const Vec3 emission = vec3(GATHER(materials, s.material, emission[0]), GATHER(materials, s.material, emission[1]),
@@ -114,7 +121,7 @@ kernel void measure_probes(SCENE_PARAMETERS, __global Probe *probes)
                             GATHER(materials, beyond.material, base_color[2]));
     value += luminance_of(color)
              * reflected_light(params, TRIANGLE_ARGUMENTS, surfaces NORMAL_ARGUMENTS,
-                               materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS, lights LAST_SKY SEEDS_ARGUMENT,
+                               materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS, lights LAST_SKY RAY_ARGUMENTS,
                                hit, beyond, choice, mix_bits(seed + 1u));
 
     float lane[2][W];
@@ -169,7 +176,7 @@ kernel void place_probes(SCENE_PARAMETERS CHOICE_PARAMETERS, __global Probe *pro
     const UInt row = divide(at, columns);
     const UInt column = at - row * columns;
     const UInt seed = mix_bits(at + mix_bits((UInt)(params->seed + params->first_pass * 0x9e3779b9u)));
-    DEFINE_PROBE_SEEDS(seed);
+    DEFINE_PROBE_RAYS(seed, 1u);
     UInt random[4];
     for (uint k = 0; k < 4; ++k)
         random[k] = mix_bits(seed + (k + 2u) * 0x9e3779b9u);
@@ -180,6 +187,7 @@ kernel void place_probes(SCENE_PARAMETERS CHOICE_PARAMETERS, __global Probe *pro
     const Vec3 away = camera_ray(params, x + (float)params->crop_x, y + (float)params->crop_y, (Float)(0.0f),
                                  (Float)(0.0f), &eye);
     const Hits seen = closest_hits(params, MASK_ALL, eye, away, GEOMETRY_ARGUMENTS);
+    SET_PROBE_RAYS(0u);
     const Mask there = seen.triangle != NO_HIT;
     const Vec3 wo = scale(away, (Float)(-1.0f));
     const SurfacePoint s = surface_point(pick_u(there, seen.triangle, (UInt)(0u)), seen.u, seen.v, wo,

@@ -8,7 +8,7 @@ import numpy as np
 
 from psf_cl import tables
 from psf_cl.device import layout
-from psf_cl.scene.model import Scene, Shape, emits, has_tangents, is_cut_out
+from psf_cl.scene.model import Scene, Shape, emits, has_tangents, hides_back, is_cut_out
 
 #: A scene of two levels has at most one of so many of the triangles that it shows: the upper level
 #: and the way of rays into meshes cost time.
@@ -132,7 +132,7 @@ def _mesh_key(scene: Scene, shape: Shape) -> tuple[object, ...]:
         texture = scene.textures[index] if index >= 0 else None
         directions = (texture.uv_set, texture.transform) if texture is not None else ()
     own = shape.material if is_cut_out(material, shape.mesh) else None
-    return (id(shape.mesh), directions, own)
+    return (id(shape.mesh), directions, hides_back(material), own)
 
 
 def _index_bits(levels: Levels) -> int:

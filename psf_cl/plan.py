@@ -17,11 +17,13 @@ from psf_cl.measure.timing import Declared
 from psf_cl.motion import corner_labels, count_moving, lights_change
 from psf_cl.scene.model import (
     TEXTURE_FIELDS,
+    Material,
     Scene,
     emits,
     has_environment,
     has_layers,
     has_tangents,
+    hides_back,
     is_cut_out,
     lets_through,
     shines,
@@ -461,6 +463,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             if cut_out
             else "no material is cut out",
         ),
+        "BACK_FACES": _back_faces(settings, materials),
         "VERTEX_COLORS": switch(
             any(shape.mesh.colors is not None for shape in shapes),
             "a mesh has colours",
@@ -532,6 +535,15 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "integrator is path",
         ),
     }
+
+
+def _back_faces(settings: Settings, materials: list[Material]) -> Feature:
+    """Return whether the camera looks through backs."""
+    if settings.back_faces == "shown":
+        return Feature(0, "back_faces is shown")
+    if not any(hides_back(material) for material in materials):
+        return Feature(0, "no material is said to be single-sided, or only glass")
+    return Feature(1, "the camera looks through the backs of single-sided materials")
 
 
 def _motion(scene: Scene) -> Feature:

@@ -85,6 +85,11 @@ class Settings:
     roulette_depth: int = _number(
         5, 0, 1 << 20, doc="bounces before Russian roulette may end a path"
     )
+    back_faces: str = _choice(
+        "hidden",
+        "shown",
+        doc="whether the camera looks through the backs of materials that are not double-sided",
+    )
     max_depth: int = _number(16, 0, 1 << 20, doc="bounces; 0 is what the camera sees directly")
     sampler: str = _choice(
         "sobol", "random", doc="Owen-scrambled Sobol' points, or independent numbers"

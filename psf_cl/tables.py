@@ -23,6 +23,7 @@ from psf_cl.scene.model import (
     emits,
     has_environment,
     has_tangents,
+    hides_back,
     is_cut_out,
     is_invisible,
     shines,
@@ -338,6 +339,7 @@ def material_table(materials: tuple[Material, ...]) -> np.ndarray:
             "MATERIAL_ALPHA_BLEND": material.alpha_mode == "blend",
             "MATERIAL_UNLIT": material.unlit,
             "MATERIAL_THIN": material.thin_walled,
+            "MATERIAL_HIDES_BACK": hides_back(material),
         }
         row["flags"] = sum(layout.CONSTANT[name] for name, value in flags.items() if value)
         if material.unlit:

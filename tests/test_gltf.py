@@ -599,6 +599,7 @@ def test_defaults_are_those_of_gltf(builder: Builder, tmp_path: Path) -> None:
     assert (material.specular, material.transmission) == (1.0, 0.0)
     assert material.emission == (0.0, 0.0, 0.0)
     assert (material.alpha_mode, material.double_sided) == ("opaque", False)
+    assert material.back_hidden
     assert material.base_color_texture == material.emission_texture == -1
 
 
@@ -631,6 +632,7 @@ def test_every_factor_arrives(tmp_path: Path) -> None:
     assert (material.alpha_mode, material.alpha_cutoff) == ("mask", 0.7)
     assert (material.ior, material.transmission, material.specular) == (1.33, 0.9, 0.8)
     assert material.double_sided
+    assert not material.back_hidden
 
 
 def test_blending_and_unlit_are_read(tmp_path: Path) -> None:

@@ -242,7 +242,7 @@ def test_every_flag_at_once_renders(wants):
     flags = [flag for flag in CHOICES if flag != "ENVIRONMENT"]
     scene, _ = with_flags(*flags)
     # Flags that bring others with them: colours of corners, a tangent frame, layers over the base.
-    layered = Material(clearcoat=1.0, anisotropy=0.5)
+    layered = Material(clearcoat=1.0, anisotropy=0.5, back_hidden=True)
     colored = replace(FLAT_QUAD, colors=np.ones((len(FLAT_QUAD.positions), 4), np.float32))
     shape = replace(scene.shapes[0], mesh=colored, material=len(scene.materials))
     scene = replace(scene, shapes=(*scene.shapes, shape), materials=(*scene.materials, layered))

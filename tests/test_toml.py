@@ -97,6 +97,23 @@ def test_two_sided_makes_both_sides_emit(folder):
     assert scene.materials[scene.shapes[0].material].double_sided
 
 
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [("", False), ("double_sided = false", True), ("double_sided = true", False)],
+)
+def test_backs_are_hidden_where_the_file_says_so(folder, keys, expected):
+    text = f'[materials.red]\nroughness = 0.25\n{keys}\n[[shapes]]\nmesh = "tri.obj"\n'
+    (red,) = (material for material in load(folder, text).materials if material.name == "red")
+    assert red.back_hidden == expected
+
+
+def test_what_emits_from_both_sides_is_seen_from_both(folder):
+    text = "[materials.lamp]\ndouble_sided = false\n"
+    text += QUAD + 'material = "lamp"\nemission = [1, 1, 1]\ntwo_sided = true\n'
+    scene = load(folder, text)
+    assert not scene.materials[scene.shapes[0].material].back_hidden
+
+
 def test_a_mesh_that_is_placed_twice_is_loaded_once(folder):
     scene = load(folder, '[[shapes]]\nmesh = "tri.obj"\n' * 2)
     assert len(scene.shapes) == 4

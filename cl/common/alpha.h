@@ -1,29 +1,49 @@
 // Surfaces that are there in part: masks, and blending by chance.  Include before traverse.h.
 //
 // With blending (ALPHA 2) a ray has a seed, and the random number of a hit is a function of that and the
-// triangle: the same whatever else the ray meets, in whatever order.
+// triangle: the same whatever else the ray meets, in whatever order.  With BACK_FACES a ray also says
+// whether it is the camera's (sides.h); what both take goes by the name of ALPHA.
 #pragma once
 
 #include "lanes.h"
 #include "rng.h"
 #include "texture.h"
 
-#if ALPHA
+// What functions need of their rays, beside the kernel's buffers.
+#if ALPHA == 2
+#define SEED_PARAMETER , const uint *ray_seeds
+#define SEED_ARGUMENT_OF(lane) , ray_seeds + (lane)
+#else
+#define SEED_PARAMETER
+#define SEED_ARGUMENT_OF(lane)
+#endif
+#if BACK_FACES
+#define RAY_PARAMETERS SEED_PARAMETER, const uint *camera_rays
+#define RAY_ARGUMENTS_OF(lane) SEED_ARGUMENT_OF(lane), camera_rays + (lane)
+#else
+#define RAY_PARAMETERS SEED_PARAMETER
+#define RAY_ARGUMENTS_OF(lane) SEED_ARGUMENT_OF(lane)
+#endif
+#define RAY_ARGUMENTS RAY_ARGUMENTS_OF(0)
 
-// What a kernel needs for it; functions also need the seeds of their rays.
+#if ALPHA || BACK_FACES
+// What a kernel needs.
 #define ALPHA_BUFFERS                                                                              \
     , __global const Surface *surfaces,                                                            \
         __global const Material *materials TEXTURE_PARAMETERS COLOR_PARAMETERS
 #define ALPHA_BUFFER_ARGUMENTS , surfaces, materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS
-#if ALPHA == 2
-#define ALPHA_PARAMETERS ALPHA_BUFFERS, const uint *ray_seeds
-#define ALPHA_ARGUMENTS ALPHA_BUFFER_ARGUMENTS, ray_seeds
-#define ALPHA_ARGUMENTS_OF(lane) ALPHA_BUFFER_ARGUMENTS, ray_seeds + (lane)
+#define ALPHA_PARAMETERS ALPHA_BUFFERS RAY_PARAMETERS
+#define ALPHA_ARGUMENTS ALPHA_BUFFER_ARGUMENTS RAY_ARGUMENTS
+#define ALPHA_ARGUMENTS_OF(lane) ALPHA_BUFFER_ARGUMENTS RAY_ARGUMENTS_OF(lane)
 #else
-#define ALPHA_PARAMETERS ALPHA_BUFFERS
-#define ALPHA_ARGUMENTS ALPHA_BUFFER_ARGUMENTS
-#define ALPHA_ARGUMENTS_OF(lane) ALPHA_ARGUMENTS
+#define ALPHA_BUFFERS
+#define ALPHA_BUFFER_ARGUMENTS
+#define ALPHA_PARAMETERS
+#define ALPHA_ARGUMENTS
+#define ALPHA_ARGUMENTS_OF(lane)
 #endif
+
+#if ALPHA
 
 /// Opacity of a triangle at barycentrics (u, v).
 static inline float opacity(
@@ -98,21 +118,24 @@ static inline Float alpha_share(Mask mask, UInt triangle, Float u, Float v ALPHA
     return pick(mask, alpha, (Float)(1.0f));
 }
 
-#else
-#define ALPHA_BUFFERS
-#define ALPHA_BUFFER_ARGUMENTS
-#define ALPHA_PARAMETERS
-#define ALPHA_ARGUMENTS
-#define ALPHA_ARGUMENTS_OF(lane)
 #endif
 
-// Before rays are traced: seeds of the paths' rays number `number`, if a hit may be left to chance.
+// Before rays are traced: seeds of the paths' rays number `number`, if a hit may be left to chance, and
+// which of them are the camera's: the first, number 0.
 #if ALPHA == 2
 #define DEFINE_RAY_SEEDS(path, number)                                                             \
     uint ray_seeds[W];                                                                             \
     store_lanes_u(mix_bits(get_u(path, PATH_SEED)                                                  \
                            ^ mix_bits(get_u(path, PATH_SAMPLE) * 0x9e3779b9u + (number))),         \
-                  ray_seeds)
+                  ray_seeds);
 #else
 #define DEFINE_RAY_SEEDS(path, number)
+#endif
+#if BACK_FACES
+#define DEFINE_RAY_TRAITS(path, number)                                                            \
+    DEFINE_RAY_SEEDS(path, number)                                                                 \
+    uint camera_rays[W];                                                                           \
+    store_lanes_u(pick_u((number) == 0u, (UInt)(1u), (UInt)(0u)), camera_rays)
+#else
+#define DEFINE_RAY_TRAITS(path, number) DEFINE_RAY_SEEDS(path, number)
 #endif

@@ -10,6 +10,9 @@
 #ifndef ALPHA
 #error "ALPHA must be 0 (none), 1 (masks) or 2 (also blending)"
 #endif
+#ifndef BACK_FACES
+#error "BACK_FACES must be 0 or 1 (the camera looks through some)"
+#endif
 #ifndef VERTEX_COLORS
 #error "VERTEX_COLORS must be 0 or 1"
 #endif

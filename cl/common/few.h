@@ -11,6 +11,7 @@
 #include "layout.h"
 #include "alpha.h"
 #include "geometry.h"
+#include "sides.h"
 
 #if FEW // room for so many corners
 
@@ -150,6 +151,10 @@ static inline Hits trace_closest_few(
     best.u = (Float)(0.0f);
     best.v = (Float)(0.0f);
     best.triangle = (UInt)(NO_HIT);
+#if BACK_FACES
+    const Mask camera = active & (load_lanes_u(camera_rays) != 0u);
+    const bool some_camera = any_lane(camera);
+#endif
     for (uint first = 0; first < params->face_count; first += FACE_RUN) {
         uint met = met_faces(&seen, faces, first, min(params->face_count - first, FACE_RUN), active);
         for (; met; met &= met - 1u) {
@@ -160,6 +165,10 @@ static inline Hits trace_closest_few(
             const Float distance = from_bits(
                 as_bits(e.u * seen.z[face.x] + e.v * seen.z[face.y] + e.w * seen.z[face.z]) ^ minus);
             Mask nearer = e.inside & (distance > 0.0f) & (distance * size < far * determinant);
+#if BACK_FACES
+            if (some_camera)
+                nearer &= !looked_through_lanes(camera, face.w & ~ALPHA_BIT, direction, surfaces, materials);
+#endif
 #if ALPHA
             if (face.w & ALPHA_BIT) {
                 const Float inverse = 1.0f / e.determinant;

@@ -92,7 +92,11 @@ static inline uint intersect_instances(
 // Whether what blends is there is drawn anew for each instance.
 #if ALPHA == 2
 #define DEFINE_INSTANCE_SEED(number) const uint instance_seed = *ray_seeds ^ (number)*0x85ebca6bu
+#if BACK_FACES
+#define ALPHA_ARGUMENTS_INSIDE ALPHA_BUFFER_ARGUMENTS, &instance_seed, camera_rays
+#else
 #define ALPHA_ARGUMENTS_INSIDE ALPHA_BUFFER_ARGUMENTS, &instance_seed
+#endif
 #else
 #define DEFINE_INSTANCE_SEED(number)
 #define ALPHA_ARGUMENTS_INSIDE ALPHA_ARGUMENTS

@@ -14,6 +14,7 @@
 #define MATERIAL_ALPHA_BLEND 4u // with a chance of alpha a hit is there
 #define MATERIAL_UNLIT 8u // what it emits is its base colour; it is no light
 #define MATERIAL_THIN 16u // a sheet of glass: light goes through unbent
+#define MATERIAL_HIDES_BACK 32u // the camera looks through what it would see from behind
 #define TEXTURE_CLAMP_U 1u
 #define TEXTURE_MIRROR_U 2u
 #define TEXTURE_CLAMP_V 4u

@@ -1,6 +1,6 @@
 // The rays of all lanes through the scene: a tree, one of two levels, or all triangles of FEW.
 //
-// GEOMETRY_BUFFERS are what a kernel needs for it; before it calls, it says DEFINE_RAY_SEEDS.
+// GEOMETRY_BUFFERS are what a kernel needs for it; before it calls, it says DEFINE_RAY_TRAITS.
 #pragma once
 
 #include "lanes.h"

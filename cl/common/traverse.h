@@ -3,6 +3,7 @@
 
 #include "geometry.h"
 #include "lanes.h"
+#include "sides.h"
 
 #ifndef ALPHA
 #define ALPHA 0
@@ -28,6 +29,12 @@
     (((id) & ALPHA_BIT) == 0 || alpha_passes((id) & ~ALPHA_BIT, (u), (v) ALPHA_ARGUMENTS))
 #else
 #define IS_THERE(id, u, v) true
+#endif
+#if BACK_FACES
+#define IS_SEEN(id, ray)                                                                           \
+    (!*camera_rays || !is_looked_through((id) & ~ALPHA_BIT, (ray), surfaces, materials))
+#else
+#define IS_SEEN(id, ray) true
 #endif
 
 /// Bit k of the result is set where lane k of `mask` is -1.
@@ -132,7 +139,7 @@ static inline void trace_closest_from(
                     const uint id = block->id[k];
                     const uint triangle = TRIANGLE_OF(id);
                     if ((t[k] < best.t || (t[k] == best.t && triangle < best.triangle))
-                        && IS_THERE(id, u[k], v[k])) {
+                        && IS_SEEN(id, ray) && IS_THERE(id, u[k], v[k])) {
                         best.t = t[k];
                         best.u = u[k];
                         best.v = v[k];

@@ -805,6 +805,7 @@ CONSTANTS = (
     ("MATERIAL_ALPHA_BLEND", 4, "with a chance of alpha a hit is there"),
     ("MATERIAL_UNLIT", 8, "what it emits is its base colour; it is no light"),
     ("MATERIAL_THIN", 16, "a sheet of glass: light goes through unbent"),
+    ("MATERIAL_HIDES_BACK", 32, "the camera looks through what it would see from behind"),
     ("TEXTURE_CLAMP_U", 1, ""),
     ("TEXTURE_MIRROR_U", 2, ""),
     ("TEXTURE_CLAMP_V", 4, ""),

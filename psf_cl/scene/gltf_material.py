@@ -135,6 +135,7 @@ class MaterialReader:
             emission=self.limited(channel * strength for channel in emission),
             emission_texture=self._texture(item, "emissiveTexture") if any(emission) else -1,
             double_sided=item.flag("doubleSided"),
+            back_hidden=not item.flag("doubleSided"),
             unlit=item.extension("KHR_materials_unlit") is not None,
         )
         return self._with_approximations(item, material)

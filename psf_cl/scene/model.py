@@ -79,6 +79,8 @@ class Material:
         normal_texture, normal_scale: tangent-space normals, and the factor of their x and y.
         emission: radiance (emissive factor times strength).
         double_sided: whether both sides *emit*; surfaces always reflect on both sides.
+        back_hidden: whether the camera looks through it from behind, as glTF has it of what is not
+            double-sided; glass is seen all the same.  For all other rays it is there.
         unlit: whether to show the base colour as it is, without light.
         emission_curve: what ``emission`` becomes over time, or None.
     """
@@ -118,6 +120,7 @@ class Material:
     emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
     emission_texture: int = -1
     double_sided: bool = False
+    back_hidden: bool = False
     unlit: bool = False
     emission_curve: Curve | None = None
 
@@ -370,6 +373,11 @@ def lets_through(material: Material) -> bool:
     """Return whether light passes ``material`` somewhere: where it is not metal."""
     not_metal = material.metallic < 1.0 or material.metallic_roughness_texture >= 0
     return material.transmission > 0.0 and not_metal
+
+
+def hides_back(material: Material) -> bool:
+    """Return whether the camera looks through ``material`` from behind."""
+    return material.back_hidden and not lets_through(material)
 
 
 def has_tangents(material: Material) -> bool:

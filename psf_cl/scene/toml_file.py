@@ -123,7 +123,7 @@ MATERIAL: Schema = {
     "alpha": Key(_UNIT),
     "alpha_mode": Key(text("opaque", "mask", "blend")),
     "alpha_cutoff": Key(_UNIT),
-    "double_sided": Key(flag(), "whether both sides emit"),
+    "double_sided": Key(flag(), "whether both sides emit and are seen"),
     "unlit": Key(flag(), "whether to show the base colour as it is"),
     **{name: Key(either(text(), table()), "an image file, or a table") for name in TEXTURE_FIELDS},
 }
@@ -337,6 +337,8 @@ def _read_materials(raw: dict[str, Any], place: Place, assembly: _Assembly) -> N
                 )
         if "anisotropy_rotation" in changes:
             changes["anisotropy_rotation"] = math.radians(changes["anisotropy_rotation"])
+        if "double_sided" in changes:
+            changes["back_hidden"] = not changes["double_sided"]
         for track in assembly.animations.of("material", name).values():
             changes["emission_curve"] = track.curve
         assembly.overrides[name] = changes
@@ -410,6 +412,8 @@ def _read_shape(raw: dict[str, Any], place: Place, assembly: _Assembly) -> None:
         changes |= {"emission_texture": -1, "emission_curve": tracks["emission"].curve}
     if "two_sided" in shape:
         changes["double_sided"] = shape["two_sided"]
+        if shape["two_sided"]:
+            changes["back_hidden"] = False
     for part in parts:
         material = own if own is not None else indices[part.material]
         if changes:

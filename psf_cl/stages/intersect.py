@@ -20,7 +20,7 @@ def plan(context: Context) -> StageSpec:
         "intersect",
         "every ray needs its closest hit",
         "intersect.cl",
-        flags=("FEW", "INSTANCES", "ALPHA", "VERTEX_COLORS", *POOL_FLAGS),
+        flags=("FEW", "INSTANCES", "ALPHA", "BACK_FACES", "VERTEX_COLORS", *POOL_FLAGS),
         kernels=(kernel,),
         traces=True,
     )

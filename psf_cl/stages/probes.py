@@ -33,6 +33,7 @@ def plan(context: Context) -> StageSpec | None:
             "PUNCTUAL_LIGHTS",
             "ENVIRONMENT",
             "ALPHA",
+            "BACK_FACES",
             "LENS",
             "LIGHT_SAMPLING",
         ),
