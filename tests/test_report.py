@@ -91,6 +91,11 @@ def test_the_plot_is_one_svg_and_one_png_of_the_same_shape(folder):
     assert tuple(bytes.fromhex(plot.COLOURS[0][1:])) in colours
 
 
+def test_plots_say_nothing_that_the_font_of_the_png_lacks(folder):
+    root = xml.etree.ElementTree.fromstring((folder / "error.svg").read_text(encoding="utf-8"))
+    assert all(text.isascii() for text in root.itertext())
+
+
 def test_markers_lie_where_the_logarithms_are():
     ends = [(1.0, 1.0, 1.0, 1.0), (100.0, 0.01, 0.01, 0.01)]
     series = plot.Series("a", "#000000", "square", ends)

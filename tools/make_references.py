@@ -43,6 +43,10 @@ from psf_cl.scene.digest import scene_digest
 # Fewer renders say too little of their own variance to stop by it.
 LEAST_SEEDS = 8
 
+# Of each render; fewer where the noise decides when to stop.
+SPP = 1024
+SPP_TOWARDS_NOISE = 256
+
 # Halves that differ more than this, in sigmas of the stated variance, contradict it.
 LARGEST_RMS = 1.25
 
@@ -54,7 +58,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # After that call, which makes the settings the epilog.
     parser.description = __doc__
     parser.add_argument("-o", "--output", metavar="REF.exr", required=True)
-    parser.add_argument("--spp", type=positive_integer, default=1024, help="of each render (1024)")
+    parser.add_argument(
+        "--spp",
+        type=positive_integer,
+        help=f"of each render ({SPP}; with --noise {SPP_TOWARDS_NOISE}, to stop soon after it)",
+    )
     parser.add_argument(
         "--seeds", type=positive_integer, default=LEAST_SEEDS, help="renders, at least 2 (8)"
     )
@@ -71,6 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if args.crop or args.aov:
         parser.error("--crop, --aov: a reference is the whole picture and nothing else")
 
+    spp = args.spp or (SPP_TOWARDS_NOISE if args.noise else SPP)
     exr, png = output_paths(args.output)
     record = exr.with_suffix(".json")
     for path in (exr, png, record):
@@ -82,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "scene": scene.path,
         "scene_digest": scene_digest(scene),
         "settings": {k: v for k, v in asdict(settings).items() if k != "seed"},
-        "spp_per_seed": args.spp,
+        "spp_per_seed": spp,
         "device": device.name,
     }
     running = resumed(exr, made, settings.seed, (scene.height, scene.width))
@@ -93,7 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         seed = (settings.seed + running.count) & 0xFFFFFFFF
         renderer = psf_cl.Renderer(scene, replace(settings, seed=seed), device)
         try:
-            renderer.render(spp=args.spp)
+            renderer.render(spp=spp)
             running.add(renderer.snapshot().rgb)
         finally:
             renderer.close()

@@ -129,7 +129,9 @@ def error_figure(study: Study) -> plot.Drawing:
             )
     panels = [
         plot.panel("relMSE", "seconds of rendering", curves("relmse", "seconds")),
-        plot.panel("variance (line) and bias\u00b2 (dashed, bars)", "seconds of rendering", splits),
+        plot.panel(
+            "variance (line) and squared bias (dashed, bars)", "seconds of rendering", splits
+        ),
         plot.panel(
             "relMSE without the worst 0.1 %",
             "seconds of rendering",
