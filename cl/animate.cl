@@ -4,7 +4,6 @@
 #include "common/features.h"
 #include "common/layout.h"
 
-#define OFFSET_EPSILON 0x1p-20f // as in tables.OFFSET_EPSILON
 
 static inline float3 load3(__global const float *at)
 {

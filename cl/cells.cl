@@ -267,7 +267,7 @@ static inline void look_up_samples(
 #if RESTORE
     const Vec3 lost = sub(own, light);
     const float sign = pass_is_in_half(place->pass - params->first_pass) ? -1.0f : 1.0f;
-    const Float brightness = sign * (0.2126f * lost.x + 0.7152f * lost.y + 0.0722f * lost.z);
+    const Float brightness = sign * luminance(lost);
     float lane_lost[4][W];
     store_lanes(lost.x, lane_lost[0]);
     store_lanes(lost.y, lane_lost[1]);

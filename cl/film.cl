@@ -21,7 +21,7 @@ static inline void add_sample(FilmSum *sum, float4 sample)
     add_compensated(sum, 1, sample.y);
     add_compensated(sum, 2, sample.z);
     // Running variance of the luminance (Welford 1962).
-    const float y = 0.2126f * sample.x + 0.7152f * sample.y + 0.0722f * sample.z;
+    const float y = LUMINANCE_RED * sample.x + LUMINANCE_GREEN * sample.y + LUMINANCE_BLUE * sample.z;
     const float delta = y - sum->mean;
     sum->mean += delta / (float)sum->count;
     sum->squares = min(sum->squares + delta * (y - sum->mean), FLT_MAX);

@@ -58,8 +58,6 @@
         __global const Material *materials TEXTURE_PARAMETERS COLOR_PARAMETERS,                    \
         __global const Light *lights SKY_PARAMETERS
 
-static inline Float luminance_of(Vec3 c) { return 0.2126f * c.x + 0.7152f * c.y + 0.0722f * c.z; }
-
 /// Light of the chosen light that a white surface at `s` reflects, as luminance; 0 outside of `mask`.
 LARGE_FUNCTION Float reflected_light(
     SCENE_PARAMETERS RAY_PARAMETERS, Mask mask, SurfacePoint s, LightChoice choice, UInt seed)
@@ -72,7 +70,7 @@ LARGE_FUNCTION Float reflected_light(
     if (!any_lane(lit))
         return (Float)(0.0f);
     const Mask blocked = blocked_rays(params, lit, above, light.toward, GEOMETRY_ARGUMENTS);
-    const Float arrives = luminance_of(light.radiance) * cosine * INV_PI / pick(lit, light.pdf, (Float)(1.0f));
+    const Float arrives = luminance(light.radiance) * cosine * INV_PI / pick(lit, light.pdf, (Float)(1.0f));
     return pick(lit & !blocked, arrives, (Float)(0.0f));
 }
 
@@ -106,7 +104,7 @@ kernel void measure_probes(SCENE_PARAMETERS, __global Probe *probes)
     const Mask shines = there & (s.front | ((GATHER_U(materials, s.material, flags) & MATERIAL_TWO_SIDED_EMISSION) != 0u));
     const Vec3 emission = vec3(GATHER(materials, s.material, emission[0]), GATHER(materials, s.material, emission[1]),
                                GATHER(materials, s.material, emission[2]));
-    const Float emitted = pick(shines, luminance_of(emission), (Float)(0.0f));
+    const Float emitted = pick(shines, luminance(emission), (Float)(0.0f));
 
     const Vec3 direction = vec3(GATHER(probes, at, direction[0]), GATHER(probes, at, direction[1]),
                                 GATHER(probes, at, direction[2]));
@@ -119,7 +117,7 @@ kernel void measure_probes(SCENE_PARAMETERS, __global Probe *probes)
     const Vec3 color = vec3(GATHER(materials, beyond.material, base_color[0]),
                             GATHER(materials, beyond.material, base_color[1]),
                             GATHER(materials, beyond.material, base_color[2]));
-    value += luminance_of(color)
+    value += luminance(color)
              * reflected_light(params, TRIANGLE_ARGUMENTS, surfaces NORMAL_ARGUMENTS,
                                materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS, lights LAST_SKY RAY_ARGUMENTS,
                                hit, beyond, choice, mix_bits(seed + 1u));

@@ -15,8 +15,6 @@
 // How much of a squared mean counts as noise, in variances of it.
 #define NOISE 2.0f
 
-static inline Float luminance_of(Vec3 v) { return 0.2126f * v.x + 0.7152f * v.y + 0.0722f * v.z; }
-
 static inline Vec3 gather_lost(__global const Lost *lost, UInt pixel)
 {
     return vec3(GATHER(lost, pixel, rgb[0]), GATHER(lost, pixel, rgb[1]), GATHER(lost, pixel, rgb[2]));
@@ -58,7 +56,7 @@ kernel void take_lost(
         return;
     const float count = (float)max(film[pixel].count, 1u);
     float mean = 0.0f;
-    const float weights[3] = {0.2126f, 0.7152f, 0.0722f};
+    const float weights[3] = {LUMINANCE_RED, LUMINANCE_GREEN, LUMINANCE_BLUE};
     for (uint c = 0; c < 3; ++c) {
         restored[4 * pixel + c] = (film[pixel].sum[c] - film[pixel].lost[c]) / count;
         const float lost = fabs(tilt) < 1.0f ? film_lost[pixel].rgb[c] / count : 0.0f;
@@ -136,7 +134,7 @@ kernel void restore_windows(
     const UInt high = min(row + radius, (UInt)(params->crop_height - 1u)) - (row - min(row, (UInt)(radius)));
     const Float inverse = 1.0f / to_float((wide + 1u) * (high + 1u));
     const Vec3 mean = scale(sum, inverse);
-    const Float y = luminance_of(mean);
+    const Float y = luminance(mean);
     const Vec3 back = scale(mean, sure_part(y * y, variance * inverse * inverse));
     float lane[3][W];
     store_lanes(back.x, lane[0]);
@@ -169,7 +167,7 @@ kernel void restore_pixels(__global const Params *params, __global const Lost *u
         const UInt x = min(max(column + k % 3u, (UInt)(1u)) - 1u, (UInt)(params->crop_width - 1u));
         const UInt y = min(max(row + k / 3u, (UInt)(1u)) - 1u, (UInt)(params->crop_height - 1u));
         const UInt at = pixel_entry(params, x, y);
-        const Float value = luminance_of(gather_lost(unrestored, at));
+        const Float value = luminance(gather_lost(unrestored, at));
         square += value * value;
         variance += GATHER(unrestored, at, difference);
     }

@@ -11,9 +11,6 @@
 #include "common/rng.h"
 #include "common/view.h"
 
-// Normals whose cosine is below are those of different surfaces.
-#define LEAST_COSINE 0.9f
-
 /// Take the light of each pixel from the film.  One work item a pixel.
 ///
 /// reads   film, film_base
@@ -113,7 +110,7 @@ kernel void filter_screen(
         const Surroundings there = seen_at(surfaces_seen, other);
         const Vec3 between = sub(there.p, here.p);
         const Mask agrees = inside & (other != pixel) & here.there & there.there
-                            & (dot3(here.ns, there.ns) > LEAST_COSINE)
+                            & (dot3(here.ns, there.ns) > SAME_SURFACE_COSINE)
                             & (fabs(dot3(here.ns, between)) < footprint)
                             & (fabs(dot3(there.ns, between)) < footprint)
                             & (dot3(between, between) < reach * reach);

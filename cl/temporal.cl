@@ -10,9 +10,6 @@
 #include "common/probes.h"
 #include "common/view.h"
 
-// Normals whose cosine is below are those of different surfaces.
-#define LEAST_COSINE 0.9f
-
 #if TEMPORAL == 2
 /// How much the light has changed of what was seen in a column and a row of the frame before: 0 to 1.
 static inline Float change_at(__global const Params *params, __global const float *changes, Float column, Float row)
@@ -62,13 +59,11 @@ typedef struct {
 #define PRIOR_VARIANCE 0.25f
 #define PRIOR_FRAMES 2.0f
 
-static inline Float luminance_of(Vec3 c) { return 0.2126f * c.x + 0.7152f * c.y + 0.0722f * c.z; }
-
 /// Samples that a history is worth of which a part has changed: with N of variance v and a bias b, it errs as
 /// N / (1 + N b^2 / v) without bias.  All of them if nothing has changed.
 static inline Float worth_of(Known known, Float change, Float fresh)
 {
-    const Float level = luminance_of(known.rgb);
+    const Float level = luminance(known.rgb);
     // A change of c of the brighter of both leaves at least 1 - c of it.
     const Float bias = BIAS_FACTOR * change * level / (1.0f - min(change, CERTAIN));
     const Float frames = known.count / max(fresh, 1.0f);
@@ -114,7 +109,7 @@ static inline void add_history(
     const Mask same_plane = (fabs(dot3(ns, between)) < wanted.footprint)
                             & (fabs(dot3(wanted.ns, between)) < wanted.footprint);
     const Mask same = (shape == wanted.shape)
-                      & ((shape == 0u) | (same_plane & (dot3(ns, wanted.ns) > LEAST_COSINE)));
+                      & ((shape == 0u) | (same_plane & (dot3(ns, wanted.ns) > SAME_SURFACE_COSINE)));
     // Where neither moves, the edges that a pixel sees are those that it saw.
     const Mask rests = unmoved & (still | (((shape | wanted.shape) & SHAPE_MOVES) == 0u));
     const Mask taken = inside & (count > 0.0f) & (same | rests);
@@ -225,7 +220,7 @@ kernel void blend_history(
     count = pick(changed, fresh / max(alpha, 1e-6f), count);
     alpha = pick(is_known, alpha, (Float)(1.0f));
     const Vec3 mean = add_scaled(scale(known.rgb, 1.0f - alpha), rgb, alpha);
-    const Float brightness = luminance_of(rgb);
+    const Float brightness = luminance(rgb);
     const Float square = (1.0f - alpha) * known.square + alpha * brightness * brightness;
     const Vec3 base_mean = add_scaled(scale(known.base, 1.0f - alpha), base, alpha);
 

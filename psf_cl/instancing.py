@@ -241,7 +241,7 @@ def _fill(rows: np.ndarray, transforms: np.ndarray, extent: np.ndarray) -> None:
     world = parts + np.abs(position)[..., None]
     there_and_back = np.abs(linear) @ (np.abs(inverse) @ (parts + world))
     size = np.maximum(world, there_and_back)[..., 0].max(axis=1)
-    rows["offset"] = np.maximum(tables.OFFSET_EPSILON * size, np.finfo(np.float32).tiny)
+    rows["offset"] = np.maximum(layout.OFFSET_EPSILON * size, np.finfo(np.float32).tiny)
 
 
 def _box(positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -256,6 +256,6 @@ def _world_boxes(transforms: np.ndarray, low: np.ndarray, high: np.ndarray) -> n
     """Return ``(n, 6)`` float32 boxes around a box under each transform, rounded outwards."""
     corners = np.stack([low, high])[np.indices((2, 2, 2)).reshape(3, 8).T, np.arange(3)]
     world = corners @ np.swapaxes(transforms[:, :3, :3], 1, 2) + transforms[:, None, :3, 3]
-    room = tables.OFFSET_EPSILON * np.abs(world).max(axis=(1, 2))[:, None]
+    room = layout.OFFSET_EPSILON * np.abs(world).max(axis=(1, 2))[:, None]
     boxes = np.concatenate([world.min(axis=1) - room, world.max(axis=1) + room], axis=1)
     return boxes.astype(np.float32)

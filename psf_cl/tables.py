@@ -30,10 +30,6 @@ from psf_cl.scene.model import (
 )
 from psf_cl.scene.texture import decoded_srgb
 
-#: What the rounding error of a point is bounded by, relative to the coordinates it is made of: the
-#: intersection subtracts, shears and divides, about eight roundings of 2^-24.
-OFFSET_EPSILON = 2.0**-20
-
 #: Chance that the light table keeps for emitters of finite size where there is also light from
 #: infinitely far: its flux through the scene says little about how much of it comes in.
 NEAR_SHARE = 0.5
@@ -116,7 +112,7 @@ def flatten(scene: Scene) -> Geometry:
         surface["shape"] = number
         surface["light"] = layout.CONSTANT["NO_LIGHT"]
         surface["ng"] = _front_normals(surface, mirrored=determinant < 0)
-        surface["offset"] = OFFSET_EPSILON * _extent(surface)
+        surface["offset"] = layout.OFFSET_EPSILON * _extent(surface)
         positions.append(corners.reshape(-1, 9))
         surfaces.append(surface)
         cut_out.append(np.full(len(corners), is_cut_out(material, mesh)))

@@ -5,6 +5,8 @@
 // with ~.  Dead lanes may hold anything: mask them by pick, never by multiplying with 0.
 #pragma once
 
+#include "layout.h"
+
 #define JOIN_(a, b) a##b
 #define JOIN(a, b) JOIN_(a, b)
 
@@ -242,7 +244,10 @@ static inline Vec3 pick_v(Mask mask, Vec3 then, Vec3 otherwise)
                 pick(mask, then.z, otherwise.z));
 }
 static inline Vec3 lerp3(Vec3 a, Vec3 b, Float t) { return add_scaled(a, sub(b, a), t); }
-static inline Float luminance(Vec3 rgb) { return 0.2126f * rgb.x + 0.7152f * rgb.y + 0.0722f * rgb.z; }
+static inline Float luminance(Vec3 rgb)
+{
+    return LUMINANCE_RED * rgb.x + LUMINANCE_GREEN * rgb.y + LUMINANCE_BLUE * rgb.z;
+}
 static inline Float max3(Vec3 a) { return max(a.x, max(a.y, a.z)); }
 
 /// normalize3 where the square of the length leaves the range of float.

@@ -62,6 +62,11 @@
 #define PARTICLE_PLACES 128u // of a cell of the map of photons
 #define PARTICLE_SIZES 3u // of cells of that map, each four times as wide as the one before
 #define BUCKET_SLOTS 64u // slots of a hash map that are probed for a key
+#define OFFSET_EPSILON 9.5367431640625e-07f // rounding error of a point, relative to its coordinates
+#define LUMINANCE_RED 0.2126f
+#define LUMINANCE_GREEN 0.7152f
+#define LUMINANCE_BLUE 0.0722f
+#define SAME_SURFACE_COSINE 0.9f // normals further apart are those of different surfaces
 
 #define PATH_ORIGIN_X 0u // ray origin, world, m
 #define PATH_ORIGIN_Y 1u

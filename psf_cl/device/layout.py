@@ -13,6 +13,8 @@ from functools import cached_property
 
 import numpy as np
 
+from psf_cl.scene.model import LUMINANCE
+
 
 @dataclass(frozen=True)
 class Field:
@@ -791,6 +793,17 @@ COUNTERS = (
     ("finished", "first of the ring: samples done of each pass in flight"),
 )
 
+#: What the rounding error of a point is bounded by, relative to the coordinates it is made of: the
+#: intersection subtracts, shears and divides, about eight roundings of 2^-24.
+OFFSET_EPSILON = 2.0**-20
+
+FLOAT_CONSTANTS = (
+    ("OFFSET_EPSILON", OFFSET_EPSILON, "rounding error of a point, relative to its coordinates"),
+    ("LUMINANCE_RED", LUMINANCE[0], ""),
+    ("LUMINANCE_GREEN", LUMINANCE[1], ""),
+    ("LUMINANCE_BLUE", LUMINANCE[2], ""),
+    ("SAME_SURFACE_COSINE", 0.9, "normals further apart are those of different surfaces"),
+)
 CONSTANTS = (
     ("LEAF_BIT", 0x80000000, "child[] is a block of triangles"),
     ("GROUP_BIT", 0x40000000, "child[] of a LightPair is a group of lights for photons"),
@@ -922,7 +935,10 @@ def header() -> str:
         return _define(name, f"0x{value:08X}u" if value > 0xFFFF else f"{value}u", meaning)
 
     return _FRAME.format(
-        constants="\n".join(define(*constant) for constant in CONSTANTS),
+        constants="\n".join(
+            [define(*constant) for constant in CONSTANTS]
+            + [_define(name, f"{value}f", meaning) for name, value, meaning in FLOAT_CONSTANTS]
+        ),
         paths="\n".join(_path_lines()),
         chains="\n".join(_chain_lines()),
         counters="\n".join(
