@@ -11,6 +11,7 @@
 #include "common/passes.h"
 #include "common/cells.h"
 #include "common/hash_map.h"
+#include "common/shared_samples.h"
 
 /// Where in the rings a pass is.
 typedef struct {
@@ -29,7 +30,7 @@ static inline PassPlace place_of(__global const Params *params, uint pass)
     place.samples = at * params->pixel_count;
     place.slots = at * params->cell_slots;
     place.buckets = place.slots / bucket_size(params->cell_slots);
-    place.width = params->cell_width * exp2(params->cell_shrink * log2((float)(pass - params->first_pass + 1u)));
+    place.width = cell_width_of(params, pass);
     return place;
 }
 
@@ -45,17 +46,6 @@ static inline CellQuery load_query(
     query.extra = params->cell_flags & CELL_IDENTITY ? pixel + 1u : (UInt)(0u);
     query.width = GATHER(vertices, pixel, length) * width;
     return query;
-}
-
-static inline Vec3 load_gate(__global const CellVertex *vertices, UInt pixel)
-{
-    return vec3(GATHER(vertices, pixel, gate[0]), GATHER(vertices, pixel, gate[1]), GATHER(vertices, pixel, gate[2]));
-}
-
-static inline Vec3 load_beyond(__global const Beyond *beyond, UInt pixel)
-{
-    return vec3(GATHER(beyond, pixel, radiance[0]), GATHER(beyond, pixel, radiance[1]),
-                GATHER(beyond, pixel, radiance[2]));
 }
 
 /// Cell that samples are stored in.  Neighbours are moved alike: most of a tile meets in one cell, and is
@@ -201,18 +191,6 @@ kernel void resolve_cells(
         }
     }
 }
-
-#if BASE
-/// Part of the light from beyond a sample's vertex that the base of the first surface reflects.
-static inline float4 base_share_of(__global const Beyond *beyond, __global const Seen *seen, ulong sample)
-{
-#if BASE == 2
-    if ((beyond[sample].vertex & VERTEX_MASK) > 1u)
-        return (float4)(vload3(0, seen[sample].share), 0.0f);
-#endif
-    return (float4)(1.0f);
-}
-#endif
 
 /// Add the light from behind the vertices to W samples.
 static inline void look_up_samples(
@@ -386,11 +364,6 @@ kernel void add_unfiltered(
     __global const Params *params, __global const float *samples, __global const Beyond *beyond, __global FilmSum *film)
 {
     const uint pixel = get_global_id(0);
-    if (pixel >= params->pixel_count)
-        return;
-    const ulong at = (ulong)(params->first_pass & (params->ring - 1u)) * params->pixel_count + pixel;
-    if (vload4(at, samples).w <= 0.0f || beyond[at].vertex == 0u)
-        return;
-    for (uint c = 0; c < 3; ++c)
-        film[pixel].sum[c] += beyond[at].radiance[c];
+    if (pixel < params->pixel_count)
+        add_as_it_is(params, samples, beyond, film, pixel);
 }

@@ -40,6 +40,7 @@ from psf_cl.stages import (
     metropolis,
     photons,
     probes,
+    range_search,
     restore,
     screen,
     seen,
@@ -276,6 +277,7 @@ def make_plan(
         halves=halves,
         max_depth=settings.max_depth,
         moving=count_moving(scene),
+        range_search=settings.path_filter == "range_search",
         triangle_count=triangles,
         instance_count=0 if levels is None else levels.instance_count,
         corner_count=corners,
@@ -296,6 +298,7 @@ def make_plan(
         shade,
         connect,
         cells,
+        range_search,
         splats,
         seen,
         film,
@@ -558,6 +561,8 @@ def _restore(settings: Settings) -> Feature:
     """Return whether what averages per cell lost is added back."""
     if settings.path_filter == "off":
         return Feature(0, "path_filter is off")
+    if settings.path_filter != "hash_grid":
+        return Feature(0, "what averages over balls lost is not put back")
     if not settings.filter_restore:
         return Feature(0, "filter_restore is false: averages stay as they are")
     if settings.screen_filter != "off" or settings.temporal != "off":
@@ -579,9 +584,10 @@ def _cells(settings: Settings, glossy: bool) -> Feature:
     """Return whether light is shared per cell, and if so how much of it."""
     if settings.path_filter == "off":
         return Feature(0, "path_filter is off")
+    name = f"path_filter is {settings.path_filter}"
     if glossy:
-        return Feature(2, "path_filter is hash_grid; the light of diffuse bases is shared")
-    return Feature(1, "path_filter is hash_grid; every material is matt")
+        return Feature(2, f"{name}; the light of diffuse bases is shared")
+    return Feature(1, f"{name}; every material is matt")
 
 
 def _temporal(scene: Scene, settings: Settings, features: dict[str, Feature]) -> Feature:

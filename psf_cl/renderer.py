@@ -23,6 +23,7 @@ from psf_cl.device import layout
 from psf_cl.device.bvh import MIN_STACK_SIZE, Bvh, Refit, build_bvh, warm_up_builder
 from psf_cl.device.device import Buffer, Device, open_device
 from psf_cl.device.light_tree import LightTree, warm_up_light_tree
+from psf_cl.device.primitives import Primitives
 from psf_cl.device.program import Launch, Program, load_program
 from psf_cl.device.sources import source_digest
 from psf_cl.device.two_levels import build_two_levels
@@ -46,6 +47,7 @@ from psf_cl.stages import (
     metropolis,
     photons,
     probes,
+    range_search,
     restore,
     screen,
     temporal,
@@ -126,6 +128,7 @@ class Renderer:
         self.depth_counts = np.zeros(film.CENSUS_BINS)
         self.refit: Refit | None = None
         self.light_tree: LightTree | None = None
+        self.range_search: range_search.RangeSearch | None = None
         self.rebuilds = 0
         self.buffers: dict[str, Buffer] = {}
         try:
@@ -194,6 +197,8 @@ class Renderer:
             launch(items)
 
     def _film(self) -> None:
+        if self.range_search is not None:
+            self.range_search.filter_passes(self.device.read(self.buffers["counters"]))
         for launch, items in self.cell_launches:
             launch(items, film.GROUP)
         for launch in self.splat_launches:
@@ -544,7 +549,7 @@ class Renderer:
 
     def _restores(self) -> bool:
         """Return whether the image gets back what averages lost; not if that is only built in."""
-        wanted = self.settings.filter_restore and self.settings.path_filter != "off"
+        wanted = self.settings.filter_restore and self.settings.path_filter == "hash_grid"
         alone = self.settings.screen_filter == self.settings.temporal == "off"
         return wanted and alone
 
@@ -774,6 +779,9 @@ class Renderer:
         if self.refit is not None:
             self.refit.release()
             self.refit = None
+        if self.range_search is not None:
+            self.range_search.release()
+            self.range_search = None
         self.device.release(*self.buffers.values())
         self.buffers.clear()
 
@@ -994,6 +1002,7 @@ class Renderer:
             for kernel in stage.kernels
         ]
         self._bind_cells(programs.get("cells"))
+        self._bind_range_search(programs.get("range_search"))
         self._bind_chains(programs.get("splats"))
         self.freeze_guide = (
             programs["guide"].bind(
@@ -1083,6 +1092,22 @@ class Renderer:
             )
         ]
         self.clear_cells = program.bind_planned("clear_cells", self.buffers)
+        self.add_unfiltered = program.bind_planned("add_unfiltered", self.buffers)
+
+    def _bind_range_search(self, program: Program | None) -> None:
+        if self.range_search is not None:
+            self.range_search.release()
+            self.range_search = None
+        if program is None:
+            return
+        self.range_search = range_search.RangeSearch(
+            self.device,
+            program,
+            self.buffers,
+            Primitives(self.device),
+            self.plan.pixel_count,
+            self.plan.ring,
+        )
         self.add_unfiltered = program.bind_planned("add_unfiltered", self.buffers)
 
     def _bind_restore(self, program: Program | None) -> None:

@@ -104,7 +104,9 @@ class Settings:
     path_filter: str = _choice(
         "off",
         "hash_grid",
-        doc="share what paths carry beyond a vertex: averages per cell of a hash grid",
+        "range_search",
+        doc="share what paths carry beyond a vertex: averages per cell of a hash grid, or over all "
+        "close vertices (slow, to compare)",
     )
     filter_vertex: str = _choice(
         "auto",

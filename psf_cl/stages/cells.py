@@ -91,18 +91,26 @@ def brightest(scene: Scene) -> float:
     return min(max(largest, 2.0**-40), 2.0**90) if math.isfinite(largest) else 2.0**90
 
 
-def plan(context: Context) -> StageSpec | None:
-    """Return the stage, or None if paths are not filtered."""
-    if not context.on("CELLS"):
-        return None
-    slots, samples = slots_of(context.pixel_count), context.ring * context.pixel_count
-    cell, uint32 = layout.CELL.dtype, np.dtype(np.uint32)
+def sample_buffers(context: Context) -> tuple[BufferSpec, ...]:
+    """Return what the samples in flight hand in to be shared."""
+    samples = context.ring * context.pixel_count
     in_flight = f"of {context.ring} passes in flight"
-    buffers = (
+    return (
         BufferSpec(
             "beyond", layout.BEYOND.dtype, samples, f"light behind the vertices {in_flight}", True
         ),
         BufferSpec("vertices", layout.CELL_VERTEX.dtype, samples, f"vertices {in_flight}", True),
+    )
+
+
+def plan(context: Context) -> StageSpec | None:
+    """Return the stage, or None if paths are not filtered."""
+    if not context.on("CELLS") or context.range_search:
+        return None
+    slots = slots_of(context.pixel_count)
+    cell, uint32 = layout.CELL.dtype, np.dtype(np.uint32)
+    buffers = (
+        *sample_buffers(context),
         BufferSpec("cell_keys", uint32, context.ring * slots, "fingerprints of cells", True),
         BufferSpec("cells", cell, context.ring * slots, "sums of cells", True),
         BufferSpec(

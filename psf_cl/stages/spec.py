@@ -136,6 +136,7 @@ class Context:
         pixel_count: pixels that are rendered.
         ring: passes that may be in flight, a power of two.
         crop_size: width and height of what is rendered, pixels.
+        range_search: whether light is shared in balls, not in cells.
     """
 
     features: dict[str, Feature]
@@ -154,6 +155,7 @@ class Context:
     statistics: bool = False
     halves: bool = False
     moving: MovingCounts | None = None
+    range_search: bool = False
 
     @property
     def path_field_count(self) -> int:
