@@ -12,6 +12,35 @@ static inline float sum_of(__global const GuideSum *sums, uint k)
     return (float)sums->high[k] * 0x1p32f + (float)sums->low[k];
 }
 
+/// Begin parts of the table anew that have run over: what came late had no place there.  One work item a
+/// bucket, while no path is on its way.
+///
+/// reads   guide_full
+/// writes  guide_keys, guide_full, guide_sums, guide_cells
+kernel void renew_guide(
+    __global const Params *params,
+    __global uint *guide_keys,
+    __global uint *guide_full,
+    __global GuideSum *guide_sums,
+    __global GuideCell *guide_cells)
+{
+    const uint size = bucket_size(params->guide_slots);
+    const uint bucket = get_global_id(0);
+    if (bucket >= params->guide_slots / max(size, 1u) || guide_full[bucket] == 0u)
+        return;
+    guide_full[bucket] = 0u;
+    for (uint slot = bucket * size; slot < (bucket + 1u) * size; ++slot) {
+        guide_keys[slot] = 0u;
+        guide_cells[slot].mean = 0.0f;
+        guide_cells[slot].visits = 0.0f;
+        for (uint k = 0; k < GUIDE_BINS; ++k) {
+            guide_sums[slot].low[k] = 0u;
+            guide_sums[slot].high[k] = 0u;
+            guide_sums[slot].count[k] = 0u;
+        }
+    }
+}
+
 /// Make the densities of all cells anew from their sums.  One work item a slot, while no path is on its
 /// way.
 ///

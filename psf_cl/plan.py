@@ -158,6 +158,12 @@ class Plan:
             for kernel in stage.kernels
         }
 
+    def without(self, name: str, stage: str, reason: str) -> Plan:
+        """Return the plan with the feature ``name`` off and ``stage`` left out: buffers stay fit."""
+        features = self.features | {name: Feature(0, reason)}
+        stages = tuple(other for other in self.stages if other.name != stage)
+        return dataclasses.replace(self, features=features, stages=stages)
+
     def defines(self, stage: StageSpec) -> dict[str, int]:
         """Return the macros to build ``stage`` with: what it does not depend on is 0."""
         return {

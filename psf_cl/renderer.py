@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from psf_cl.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from psf_cl.device import layout
 from psf_cl.device.bvh import MIN_STACK_SIZE, Bvh, Refit, build_bvh, warm_up_builder
 from psf_cl.device.device import Buffer, Device, open_device
+from psf_cl.device.hash_map import buckets_of
 from psf_cl.device.light_tree import LightTree, warm_up_light_tree
 from psf_cl.device.primitives import Primitives
 from psf_cl.device.program import Launch, Program, load_program
@@ -38,7 +39,7 @@ from psf_cl.scene.digest import scene_digest
 from psf_cl.scene.far import far_from_origin, moved
 from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Scene
-from psf_cl.scheduler import Hooks, Progress, Scheduler, doubling_epoch
+from psf_cl.scheduler import MAX_PASSES, Hooks, Progress, Scheduler, doubling_epoch
 from psf_cl.settings import Settings, resolve
 from psf_cl.stages import (
     cells,
@@ -118,6 +119,8 @@ class Renderer:
             )
 
         self.plan: Plan = plan_for(there)
+        self.running = self.plan
+        self.guide_out: int | None = None
         self.compile_seconds = 0.0
         self.technique_seconds = 0.0
         self.statistics = statistics
@@ -130,6 +133,7 @@ class Renderer:
         self.light_tree: LightTree | None = None
         self.range_search: range_search.RangeSearch | None = None
         self.rebuilds = 0
+        self.changed = False
         self.buffers: dict[str, Buffer] = {}
         try:
             self._set_up(plan_for)
@@ -139,9 +143,7 @@ class Renderer:
         self.scheduler = Scheduler(
             Hooks(self._bounce, self._film, self._counters, self._limit, self._between),
             self.plan.traits.slots,
-            partial(doubling_epoch, shortest=self.plan.shortest_epoch)
-            if self.plan.in_epochs
-            else None,
+            self._epoch_end if self.plan.in_epochs else None,
         )
         self.scheduler.clock.seconds += self.technique_seconds
 
@@ -160,6 +162,7 @@ class Renderer:
                     self._release()
                     try:
                         self.plan = plan_for(Room(int(LESS_ROOM * self.plan.peak_bytes)))
+                        self.running = self.plan
                     except DeviceError:
                         raise DeviceError(
                             f"{error}; a smaller --size or --crop, or fewer --aov, need less"
@@ -233,7 +236,7 @@ class Renderer:
 
     def _between(self, start: int) -> None:
         """Do what the paths of an epoch need that begins with pass ``start``."""
-        if self.freeze_guide is not None:
+        if "guide_cells" in self.buffers:
             self._teach(start)
         if self.chains is not None:
             is_first = start == self.scheduler.first
@@ -241,9 +244,20 @@ class Renderer:
         if self.photon_map is not None:
             if start == self.scheduler.first:
                 self.photon_map.clear()
-            passes = self.scheduler.epoch_end(start) - start
+            passes = len(self._epoch(start))
             count = photons.photons_for(self.settings, passes, self.plan.pixel_count)
             self.photon_map.add(count)
+
+    def _epoch_end(self, passes: int) -> int:
+        """Return the pass before which the epoch ends that starts with pass ``passes`` of a frame."""
+        if not self.running.in_epochs:
+            return MAX_PASSES
+        return doubling_epoch(passes, self.plan.shortest_epoch)
+
+    def _epoch(self, start: int) -> range:
+        """Return the epoch that starts with pass ``start``, counted over all frames."""
+        first = self.scheduler.first
+        return range(start, first + self._epoch_end(start - first))
 
     # Frames.
 
@@ -277,6 +291,7 @@ class Renderer:
                     self._fit_tree()
             if self.lights_change:
                 self._change_lights()
+            self.changed = self.lights_change or (self.mover is not None and self.mover.moved)
             values["history_flags"] = self._history_flags(before, values) if whole else 0
             self._set_params(values | {"first_pass": first})
             if whole:
@@ -296,7 +311,7 @@ class Renderer:
 
     def _find_changes(self) -> None:
         """Find where light has changed since the frame before, if that is asked for."""
-        if self.lights_change or (self.mover is not None and self.mover.moved):
+        if self.changed:
             for launch, items in self.change_launches:
                 launch(items)
         elif "changes" in self.buffers:
@@ -620,6 +635,8 @@ class Renderer:
         for name, array in state.buffers.items():
             self.device.write(self.buffers[name], array)
         self.scheduler.resume(state.passes, state.epoch, state.seconds)
+        if counters[index["guide_off"]]:
+            self._guide(False, state.passes)
         if state.device != self.device.name:
             self.other_device = state.device
 
@@ -694,28 +711,52 @@ class Renderer:
 
     def _teach(self, start: int) -> None:
         """Draw the epoch of pass ``start`` by what was learned so far, if that pays."""
-        at = layout.COUNTER_INDEX["guide_off"]
-        left_out = bool(self.device.read(self.buffers["counters"])[at])
-        passes = start - self.scheduler.first
-        if not left_out:
-            # What another frame taught fades too.
-            fades = start > 0 and passes <= guide.FADING_PASSES
+        new_frame = start == self.scheduler.first > 0
+        if self.guide_out is not None and new_frame and self.changed:
+            if start - self.guide_out >= guide.PASSES_WITHOUT:
+                self._guide(True, start)
+        if self.guide_out is None:
+            slots = guide.slots_of(self.plan.pixel_count)
+            if new_frame:
+                self.renew_guide(buckets_of(slots), film.GROUP)
+            # What was learned from little fades, and what was true before something changed.
+            fades = 0 < start <= guide.FADING_PASSES or (new_frame and self.changed)
             self.freeze_guide.set(fades=int(fades))
-            self.freeze_guide(guide.slots_of(self.plan.pixel_count), film.GROUP)
-        if not left_out and passes >= guide.FIRST_DECISION:
-            cells = self.device.read(self.buffers["guide_cells"])
-            left_out = not guide.is_worth_it(cells, self.settings.guide_share)
-        end = start + doubling_epoch(passes, self.plan.shortest_epoch) - passes
-        limit = 0 if left_out else guide.learn_limit(range(start, end))
+            self.freeze_guide(slots, film.GROUP)
+            if start >= guide.FIRST_DECISION:
+                cells = self.device.read(self.buffers["guide_cells"])
+                if not guide.is_worth_it(cells, self.settings.guide_share):
+                    self._guide(False, start)
+        left_out = self.guide_out is not None
+        limit = 0 if left_out else guide.learn_limit(self._epoch(start))
+        at = layout.COUNTER_INDEX["guide_off"]
         self.device.write(self.buffers["counters"], np.array([left_out, limit], np.uint32), at)
 
+    def _guide(self, on: bool, start: int) -> None:
+        """Go on with or without the guide from pass ``start`` on; no path may be on its way.
+
+        The programs without it are those of a render that has none: it costs nothing from then on.
+        """
+        self.guide_out = None if on else start
+        self.running = self.plan
+        if not on:
+            self.running = self.plan.without("GUIDE", "guide", "the guide does not pay here")
+        with self.outside_time():
+            self.programs = self._compile(self.bvh.stack_size if self.bvh else MIN_STACK_SIZE)
+            self._bind(self.programs)
+            # Paths have other fields now; slots that waited for a later pass have lost it.
+            self.device.fill(self.buffers["pool"])
+            for name, value in (("next_pass", start), ("next_pixel", 0)):
+                at = layout.COUNTER_INDEX[name]
+                self.device.write(self.buffers["counters"], np.array([value], np.uint32), at)
+
     def _guide_statistics(self, counters: np.ndarray) -> dict[str, int | float] | None:
-        if self.freeze_guide is None:
+        if "guide_keys" not in self.buffers:
             return None
         keys = self.device.read(self.buffers["guide_keys"])
         cells = self.device.read(self.buffers["guide_cells"])
         return {
-            "left_out": bool(counters[layout.COUNTER_INDEX["guide_off"]]),
+            "left_out": self.guide_out is not None,
             "noise_left": guide.noise_left(cells, self.settings.guide_share),
             "cells": int(np.count_nonzero(keys)),
             "load": float(np.count_nonzero(keys)) / len(keys),
@@ -979,10 +1020,10 @@ class Renderer:
         """Build the stages' programs, down to machine code; runs beside the scene's loading."""
         start = time.perf_counter()
         programs = {}
-        for stage in self.plan.stages:
+        for stage in self.running.stages:
             if stage.per_frame:
                 continue
-            defines = self.plan.defines(stage)
+            defines = self.running.defines(stage)
             if stage.traces:
                 defines |= {"STACK_SIZE": stack_size}
             programs[stage.name] = load_program(self.device, stage.source, defines)
@@ -997,26 +1038,18 @@ class Renderer:
                 programs[stage.name].bind_planned(kernel.name, self.buffers),
                 -(-traits.slots // kernel.paths_per_item(traits)),
             )
-            for stage in self.plan.stages
+            for stage in self.running.stages
             if not (stage.per_pass or stage.per_frame)
             for kernel in stage.kernels
         ]
         self._bind_cells(programs.get("cells"))
         self._bind_range_search(programs.get("range_search"))
         self._bind_chains(programs.get("splats"))
-        self.freeze_guide = (
-            programs["guide"].bind(
-                "freeze_guide",
-                params=self.buffers["params"],
-                guide_keys=self.buffers["guide_keys"],
-                guide_full=self.buffers["guide_full"],
-                guide_sums=self.buffers["guide_sums"],
-                guide_cells=self.buffers["guide_cells"],
-                fades=0,
+        if "guide" in programs:
+            self.freeze_guide = programs["guide"].bind_planned(
+                "freeze_guide", self.buffers, fades=0
             )
-            if "guide" in programs
-            else None
-        )
+            self.renew_guide = programs["guide"].bind_planned("renew_guide", self.buffers)
         self.photon_map = None
         if "photons" in programs:
             intersect = next(s for s in self.plan.stages if s.name == "intersect").kernels[0]

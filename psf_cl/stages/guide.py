@@ -37,6 +37,9 @@ FIRST_DECISION = 8
 MOST_NOISE_LEFT = 0.6
 ENOUGH_VISITS = 64.0
 
+#: Passes of a sequence without the guide, before a change in the scene has it tried again.
+PASSES_WITHOUT = 256
+
 
 def slots_of(pixel_count: int) -> int:
     """Return the slots of the table."""
@@ -102,15 +105,16 @@ def plan(context: Context) -> StageSpec | None:
         BufferSpec("guide_sums", sums, slots, "what the guide learns"),
         BufferSpec("guide_cells", cells, slots, "what the guide knows"),
     )
-    kernel = KernelSpec(
-        "freeze_guide", record_bytes=4 + sums.itemsize + cells.itemsize, lanes=False
+    kernels = (
+        KernelSpec("renew_guide", record_bytes=4, lanes=False),
+        KernelSpec("freeze_guide", record_bytes=4 + sums.itemsize + cells.itemsize, lanes=False),
     )
     return StageSpec(
         "guide",
         "directions are drawn by what was learned",
         "guide.cl",
         flags=("GUIDE",),
-        kernels=(kernel,),
+        kernels=kernels,
         buffers=buffers,
         per_pass=True,
         between_passes=True,
