@@ -159,7 +159,7 @@ class Plan:
         }
 
     def without(self, name: str, stage: str, reason: str) -> Plan:
-        """Return the plan with the feature ``name`` off and ``stage`` left out: buffers stay fit."""
+        """Return the plan with feature ``name`` off, without ``stage``; buffers stay fit."""
         features = self.features | {name: Feature(0, reason)}
         stages = tuple(other for other in self.stages if other.name != stage)
         return dataclasses.replace(self, features=features, stages=stages)

@@ -249,7 +249,7 @@ class Renderer:
             self.photon_map.add(count)
 
     def _epoch_end(self, passes: int) -> int:
-        """Return the pass before which the epoch ends that starts with pass ``passes`` of a frame."""
+        """Return the pass of a frame before which the epoch ends that starts with ``passes``."""
         if not self.running.in_epochs:
             return MAX_PASSES
         return doubling_epoch(passes, self.plan.shortest_epoch)
@@ -728,7 +728,7 @@ class Renderer:
                 if not guide.is_worth_it(cells, self.settings.guide_share):
                     self._guide(False, start)
         left_out = self.guide_out is not None
-        limit = 0 if left_out else guide.learn_limit(self._epoch(start))
+        limit = 0 if left_out else guide.learn_limit(self._epoch(start), self.plan.pixel_count)
         at = layout.COUNTER_INDEX["guide_off"]
         self.device.write(self.buffers["counters"], np.array([left_out, limit], np.uint32), at)
 

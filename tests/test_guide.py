@@ -26,6 +26,7 @@ from psf_cl.errors import InputError
 from psf_cl.plan import make_plan
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.model import Environment, Material
+from psf_cl.scheduler import MAX_PASSES
 from psf_cl.settings import Settings
 from psf_cl.stages import guide
 
@@ -269,8 +270,6 @@ def plain(small):
 def learned(small):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(guide, "MOST_NOISE_LEFT", 1.0)
-        # So small an image has to teach all the time.
-        patch.setattr(guide, "LEARNED_PASSES", 64)
         return noisy(small, 256, **LEARN)
 
 
@@ -334,9 +333,35 @@ def test_guide_that_does_not_pay_is_left_out(small, monkeypatch):
     white = lambertian((0.5, 0.5, 0.5))
     ball = (primitives.sphere(12, 8), np.eye(4), white)
     scene = build([ball], camera((0, 0, 3), (0, 0, 0), 45), (24, 16), environment=1.0)
-    image = render(small, scene, 24, **LEARN)
+    opened = renderer(small, scene, ("samples",), **LEARN)
+    opened.render(spp=24)
+    image = opened.image()
     assert image.stats["guide"]["left_out"]
     assert image.stats["guide"]["noise_left"] > 0.9
+    # From then on its programs are those of a render that has none, and the pool never drains.
+    assert all(program.defines.get("GUIDE", 0) == 0 for program in opened.programs.values())
+    assert opened.scheduler.epoch.stop == MAX_PASSES
+    opened.close()
+    np.testing.assert_array_equal(image.aovs["samples"], 24)
+
+
+def test_guide_comes_back_to_a_sequence_that_changes(small, monkeypatch):
+    """Left out on a still scene it stays so; after a change and enough passes it is tried again."""
+    monkeypatch.setattr(guide, "PASSES_WITHOUT", 8)
+    opened = renderer(small, room(), **LEARN)
+    opened.render(spp=2)
+    opened._guide(False, 2)
+    opened.set_frame(0.0)
+    opened.render(spp=12)
+    assert opened.guide_out == 2
+    opened.set_frame(0.0)
+    opened.changed = True
+    opened.render(spp=2)
+    stats = opened.stats()
+    samples = opened.image().aovs
+    opened.close()
+    assert opened.guide_out is None and not stats["guide"]["left_out"]
+    assert samples["rgb"].mean() > 0
 
 
 def test_light_too_bright_for_the_sums_is_counted_and_left_out(small):

@@ -23,8 +23,11 @@ MOST_VISITS = 1 << 28
 #: Edges of cells, in radii of the scene.
 LEAST_EDGE, MOST_EDGE = 2.0**-10, 2.0**-3
 
-#: Passes of an epoch that are learned from, once epochs are longer.
+#: Passes of an epoch that are learned from at least, and pixels up to which all of them are.
+#: Measured on a small picture: learning from four of 64 passes leaves twice the noise, in 0.9 of
+#: the time, for cells are visited too rarely.
 LEARNED_PASSES = 4
+LEARNED_PIXELS = 1 << 14
 
 
 #: First passes whose epochs count half after each: what was learned from little fades.
@@ -35,7 +38,7 @@ FADING_PASSES = 32
 #: takes about half as much time again.  A visit falls into a cell of so many, or nothing is found.
 FIRST_DECISION = 8
 MOST_NOISE_LEFT = 0.6
-ENOUGH_VISITS = 64.0
+ENOUGH_VISITS = 32.0
 
 #: Passes of a sequence without the guide, before a change in the scene has it tried again.
 PASSES_WITHOUT = 256
@@ -62,9 +65,10 @@ def parameters(
     }
 
 
-def learn_limit(epoch: range) -> int:
+def learn_limit(epoch: range, pixel_count: int) -> int:
     """Return the first pass of the epoch that nothing is learned from."""
-    return epoch.start + min(len(epoch), LEARNED_PASSES)
+    share = max(LEARNED_PASSES, len(epoch) * LEARNED_PIXELS // pixel_count)
+    return epoch.start + min(len(epoch), share)
 
 
 def noise_left(cells: np.ndarray, share: float) -> float:
