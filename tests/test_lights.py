@@ -276,6 +276,30 @@ def test_light_from_an_area_light_adds_up_to_its_irradiance(lit):
     assert error < 4.5 * weight.std() / np.sqrt(count) + 3e-3 * expected
 
 
+@pytest.mark.parametrize("size", [1e-5, 1.0, 1e5])
+def test_shadow_rays_end_before_the_boxes_of_a_flat_light(lit, size):
+    """Else each goes down through the tree to one of 2^17 lights, which takes most of the time.
+
+    Boxes are as geometry.h says, with u = 2^-24: 10 u of the coordinates of both larger, and met up
+    to 8 u beyond a ray's end.
+    """
+    chance = np.random.default_rng(4)
+    corners = size * (chance.uniform(-1, 1, (64, 1, 3)) + chance.normal(0, 1e-3, (64, 3, 3)))
+    corners[..., 1] = size
+    scene = triangles_scene(
+        corners, [Material("m", emission=(1, 1, 1), double_sided=True)], [0] * 64
+    )
+    origin = np.float32(size * chance.uniform(-1, 1, (4096, 3)))
+    origin[:, 1] *= chance.uniform(-1, 1, 4096).astype(np.float32)
+    toward = lit(scene).sample(origin)[0].astype(np.float64)
+    u = 2.0**-24
+    slack = 10 * u * (np.abs(corners).max() + np.abs(origin).max(axis=1).astype(np.float64))
+    assert np.all(toward[:, 1] > 0)
+    assert np.all(origin[:, 1] + toward[:, 1] * (1 + 8 * u) < size - slack)
+    # But no farther before it than rounding asks for.
+    assert np.all(origin[:, 1] + toward[:, 1] > size * (1 - 1e-5))
+
+
 def test_emission_textures_glow_where_they_are_bright(lit):
     pixels = np.zeros((2, 2, 4), np.uint8)
     pixels[..., 3] = 255
