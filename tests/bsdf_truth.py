@@ -252,13 +252,24 @@ def pdf_reflection(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
 
 
 def pdf_refraction(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
-    """Visible normals (Heitz 2014, equation 16), by Walter 2007, equation 17."""
+    """Visible normals (Heitz 2014, equation 16), by Walter 2007, equation 17.
+
+    Where such a normal reflects all, it reflects.
+    """
     with np.errstate(all="ignore"):
         h = refraction_normal(b, wo, wi)
         oh, ih = dot(wo, h), dot(wi, h)
         visible = ggx(h, b.alpha) * oh / (1 + smith_lambda(wo, b.alpha)) / wo[..., 2]
         pdf = visible * b.eta**2 * np.abs(ih) / (oh + b.eta * ih) ** 2
-    return np.where((wi[..., 2] < 0) & (oh > 0) & (ih < 0), pdf, 0)
+    return np.where((wi[..., 2] < 0) & (oh > 0) & (ih < 0), pdf, pdf_total_reflection(b, wo, wi))
+
+
+def pdf_total_reflection(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
+    """Visible normals again, by Walter 2007, equation 14; 0 but where Snell's law has no answer."""
+    h = unit(wo + wi)
+    oh = dot(wo, h)
+    visible = ggx(h, b.alpha) / (1 + smith_lambda(wo, b.alpha)) / wo[..., 2]
+    return np.where((wi[..., 2] > 0) & (1 - oh**2 >= b.eta**2), visible / 4, 0)
 
 
 def pdf_diffuse(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
