@@ -8,6 +8,7 @@
 #include "common/pixels.h"
 #include "common/pool.h"
 #include "common/rng.h"
+#include "common/splits.h"
 #include "common/hash_map.h"
 
 /// Slots that have nothing to do but take the next sample.
@@ -150,7 +151,7 @@ static inline uint regenerate(
         const UInt seed = pixel_seed(y * params->width + x, params->seed);
         Float u1;
         Float u2;
-        const UInt index = reverse_bits(sample);
+        const UInt index = reversed_index(params, sample, (UInt)(0u));
         sample_pair(seed, index, (UInt)(PAIR_PIXEL), params->sampler, &u1, &u2);
         Float lens_1 = (Float)(0.0f);
         Float lens_2 = (Float)(0.0f);

@@ -11,6 +11,7 @@
 #include "common/material.h"
 #include "common/light.h"
 #include "common/sharing.h"
+#include "common/splits.h"
 #include "common/chain.h"
 #include "common/guide.h"
 #include "common/guided.h"
@@ -419,7 +420,7 @@ kernel void shade_paths(
     const Seed seed = get_u(path, PATH_SEED);
 #endif
     const UInt pair = PAIR_VERTEX + depth * VERTEX_PAIRS;
-    const UInt index = reverse_bits(sample);
+    const UInt index = reversed_index(params, sample, depth + 1u);
     UInt lobe_bits;
     UInt light_bits;
     sample_bits(seed, index, pair + PAIR_CHOICE, params->sampler, &lobe_bits, &light_bits);

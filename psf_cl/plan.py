@@ -257,6 +257,11 @@ def make_plan(
     whole_traits, traits = traits, _smaller(traits, halvings)
 
     check_together(settings)
+    if halves and settings.splits > 1:
+        raise InputError(
+            f"--noise: samples of splits={settings.splits} begin alike, so that they cannot tell "
+            "their error; expected splits=1, --spp or --seconds"
+        )
     if settings.integrator == "metropolis":
         _check_metropolis(outputs, halves)
         traits = dataclasses.replace(traits, slots=metropolis.chain_count(settings, traits))

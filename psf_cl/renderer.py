@@ -921,6 +921,8 @@ class Renderer:
             "slots": self.plan.traits.slots,
             "seed": settings.seed,
             "max_depth": settings.max_depth,
+            "splits": settings.splits,
+            "split_vertex": settings.split_vertex,
             "roulette_depth": settings.roulette_depth
             if settings.termination == "roulette"
             else 0xFFFFFFFF,

@@ -91,6 +91,10 @@ class Settings:
         doc="whether the camera looks through the backs of materials that are not double-sided",
     )
     max_depth: int = _number(16, 0, 1 << 20, doc="bounces; 0 is what the camera sees directly")
+    splits: int = _number(
+        1, 1, 1 << 16, doc="samples in a row that see the same point: splitting, to compare"
+    )
+    split_vertex: int = _number(1, 1, 8, doc="vertex where their paths part, 1 for that point")
     sampler: str = _choice(
         "sobol", "random", doc="Owen-scrambled Sobol' points, or independent numbers"
     )
@@ -243,6 +247,7 @@ METROPOLIS_NEEDS = {
     "guiding": "off",
     "path_filter": "off",
     "screen_filter": "off",
+    "splits": 1,
     "temporal": "off",
 }
 

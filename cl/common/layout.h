@@ -245,6 +245,8 @@ typedef struct {
     uint slots; // paths of the pool
     uint seed; // start of every random sequence
     uint max_depth; // bounces
+    uint splits; // samples in a row whose paths begin alike
+    uint split_vertex; // where these part, 1 for the first surface seen
     uint roulette_depth; // bounces before roulette
     uint light_count; // entries of the light table
     uint environment_light; // index of the environment in it
@@ -295,7 +297,7 @@ typedef struct {
     float guide_share; // of the directions of a diffuse lobe that the guide draws
     float guide_steps; // fixed-point steps of a sum of its radiance per unit, a power of two
     float guide_limit; // radiance from which a sample is too large for these sums
-    uint pad[3]; // fills the record
+    uint pad[1]; // fills the record
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.

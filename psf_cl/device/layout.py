@@ -88,6 +88,8 @@ PARAMS = Record(
     uint slots - paths of the pool
     uint seed - start of every random sequence
     uint max_depth - bounces
+    uint splits - samples in a row whose paths begin alike
+    uint split_vertex - where these part, 1 for the first surface seen
     uint roulette_depth - bounces before roulette
     uint light_count - entries of the light table
     uint environment_light - index of the environment in it
