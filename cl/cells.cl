@@ -10,62 +10,45 @@
 #include "common/layout.h"
 #include "common/passes.h"
 #include "common/cells.h"
+#include "common/cell_samples.h"
 #include "common/hash_map.h"
 #include "common/shared_samples.h"
+#include "common/walls.h"
 
-/// Where in the rings a pass is.
-typedef struct {
-    uint pass;
-    ulong samples;    // first sample
-    ulong slots;      // first slot of its table
-    ulong buckets;    // first bucket
-    float width;      // edge of a cell, m per m of the path
-} PassPlace;
-
-static inline PassPlace place_of(__global const Params *params, uint pass)
+#if WALLS
+/// Mark the cells where samples of complete passes met something within a cell's width: those that they are
+/// stored in, and those that they are in.  One work item W pixels, RUN times, before store_cells.
+///
+/// reads   beyond, vertices, counters
+/// writes  near_cells
+kernel void mark_near_cells(
+    __global const Params *params,
+    __global const Beyond *beyond,
+    __global const CellVertex *vertices,
+    const volatile __global uint *counters,
+    __global uint *near_cells)
 {
-    const ulong at = pass & (params->ring - 1u);
-    PassPlace place;
-    place.pass = pass;
-    place.samples = at * params->pixel_count;
-    place.slots = at * params->cell_slots;
-    place.buckets = place.slots / bucket_size(params->cell_slots);
-    place.width = cell_width_of(params, pass);
-    return place;
+    const uint first = get_global_id(0) * (W * RUN);
+    const uint end = min(first + W * RUN, params->pixel_count);
+    const uint passes = first < end ? complete_passes(params, counters) : 0u;
+    for (uint k = 0; k < passes; ++k) {
+        const PassPlace place = place_of(params, counters[COUNTER_FILM_PASS] + k);
+        __global uint *marks = near_cells + place.slots;
+        for (uint i = first; i < end; i += W) {
+            const UInt wanted = lanes_before(MASK_ALL) + i;
+            const Mask inside = wanted < params->pixel_count;
+            const UInt pixel = pick_u(inside, wanted, (UInt)(0u));
+            const UInt vertex = GATHER_U(beyond + place.samples, pixel, vertex);
+            const Mask near = inside & ((vertex & VERTEX_NEAR) != 0u);
+            if (!any_lane(near))
+                continue;
+            const CellQuery query = load_query(params, vertices + place.samples, pixel, vertex, place.width);
+            mark_cells(params, marks, near, place_to_store(params, &query, pixel, place.pass), place.pass);
+            mark_cells(params, marks, near, place_of_vertex(params, &query, pixel, place.pass), place.pass);
+        }
+    }
 }
-
-/// What the cells are asked for by the samples of the lanes in `mask`; `pixel` is in the order of pixels.
-static inline CellQuery load_query(
-    __global const Params *params, __global const CellVertex *vertices, UInt pixel, UInt vertex, float width)
-{
-    CellQuery query;
-    query.p = vec3(GATHER(vertices, pixel, p[0]), GATHER(vertices, pixel, p[1]), GATHER(vertices, pixel, p[2]));
-    query.ng = unpack_direction(GATHER_U(vertices, pixel, ng));
-    query.seen = (vertex & VERTEX_MASK) == 1u;
-    query.near = params->cell_flags & CELL_NEAR ? vertex >> 31 : (UInt)(0u);
-    query.extra = params->cell_flags & CELL_IDENTITY ? pixel + 1u : (UInt)(0u);
-    query.width = GATHER(vertices, pixel, length) * width;
-    return query;
-}
-
-/// Cell that samples are stored in.  Neighbours are moved alike: most of a tile meets in one cell, and is
-/// added to it at once.
-static inline CellKey cell_to_store(__global const Params *params, const CellQuery *query, UInt pixel, uint pass)
-{
-    UInt a;
-    UInt b;
-    cell_random(params, pixel / CELL_TILE, pass, CELL_STORE, &a, &b);
-    return cell_of(params, query, a, b);
-}
-
-/// Cell whose average samples use.
-static inline CellKey cell_to_look_up(__global const Params *params, const CellQuery *query, UInt pixel, uint pass)
-{
-    UInt a;
-    UInt b;
-    cell_random(params, pixel, pass, CELL_LOOK_UP, &a, &b);
-    return cell_of(params, query, a, b);
-}
+#endif
 
 /// Add what W samples gathered behind their vertices to cells.
 static inline void store_samples(
@@ -77,7 +60,7 @@ static inline void store_samples(
     volatile __global Cell *cells,
     __global uint *full_buckets,
     uint first,
-    const PassPlace *place)
+    const PassPlace *place WALL_BUFFERS)
 {
     const UInt wanted = lanes_before(MASK_ALL) + first;
     const Mask inside = wanted < params->pixel_count;
@@ -96,7 +79,15 @@ static inline void store_samples(
     if (!any_lane(there))
         return;
     const CellQuery query = load_query(params, vertices, pixel, vertex, place->width);
-    const CellKey key = cell_to_store(params, &query, pixel, place->pass);
+    const CellPlace at = place_to_store(params, &query, pixel, place->pass);
+    const UInt wall = wall_in_cell(params, there, &query, at, place->pass, pixel WALL_ARGUMENTS);
+    if (any_lane(wall != 0u)) {
+        uint lane_wall[W];
+        store_lanes_u(wall << VERTEX_WALL_SHIFT, lane_wall);
+        for (uint left = lane_bits(wall != 0u); left; left &= left - 1u)
+            beyond[first + lowest_bit(left)].vertex |= lane_wall[lowest_bit(left)];
+    }
+    const CellKey key = cell_key(params, &query, at, wall);
 
     const Float value[3] = {light.x, light.y, light.z};
     uint lane_low[3][W];
@@ -138,7 +129,7 @@ static inline void store_samples(
 /// A sample whose bucket is full marks it: nobody uses the bucket.  One that is too large for the sums is
 /// left out, and marked.  Both are counted.
 ///
-/// reads   beyond, vertices, counters
+/// reads   beyond, vertices, counters; with WALLS near_cells, geometry
 /// writes  cell_keys, cells, full_buckets, beyond.vertex, counters.{failed_inserts, rejected_cells} (atomic)
 kernel void store_cells(
     __global const Params *params,
@@ -147,7 +138,7 @@ kernel void store_cells(
     volatile __global uint *counters,
     volatile __global uint *cell_keys,
     volatile __global Cell *cells,
-    __global uint *full_buckets)
+    __global uint *full_buckets WALL_BUFFERS)
 {
     const uint first = get_global_id(0) * (W * RUN);
     const uint end = min(first + W * RUN, params->pixel_count);
@@ -156,7 +147,8 @@ kernel void store_cells(
         const PassPlace place = place_of(params, counters[COUNTER_FILM_PASS] + k);
         for (uint i = first; i < end; i += W)
             store_samples(params, beyond + place.samples, vertices + place.samples, counters,
-                          cell_keys + place.slots, cells + place.slots, full_buckets + place.buckets, i, &place);
+                          cell_keys + place.slots, cells + place.slots, full_buckets + place.buckets, i,
+                          &place WALL_ARGUMENTS_OF(near_cells + place.slots));
     }
 }
 
@@ -210,7 +202,7 @@ static inline void look_up_samples(
 #endif
     __global float *samples,
     uint first,
-    const PassPlace *place)
+    const PassPlace *place WALL_BUFFERS)
 {
     const UInt inside = lanes_before(MASK_ALL) + first;
     const UInt pixel = pick_u(inside < params->pixel_count, inside, (UInt)(0u));
@@ -221,18 +213,20 @@ static inline void look_up_samples(
     const Mask there = wanted & ((vertex & VERTEX_REJECTED) == 0u);
     const CellQuery query = load_query(params, vertices, pixel, vertex, place->width);
     const uint size = bucket_size(params->cell_slots);
-    CellKey key = cell_to_look_up(params, &query, pixel, place->pass);
+    const CellPlace at = place_to_look_up(params, &query, pixel, place->pass);
+    const UInt wall = wall_in_cell(params, there, &query, at, place->pass, pixel WALL_ARGUMENTS);
+    CellKey key = cell_key(params, &query, at, wall);
     UInt slot = find_lanes(keys, full_buckets, there, key.bucket, size, key.key);
     const Mask empty = there & (slot == NO_SLOT);
     if (any_lane(empty)) {
         // Nothing was stored there: the cell that the sample itself went to.
-        key = cell_to_store(params, &query, pixel, place->pass);
+        key = cell_key(params, &query, place_to_store(params, &query, pixel, place->pass), wall_at_store(vertex));
         slot = pick_u(empty, find_lanes(keys, full_buckets, empty, key.bucket, size, key.key), slot);
     }
     const Mask found = slot != NO_SLOT;
-    const UInt at = pick_u(found, slot, (UInt)(0u));
-    const Vec3 mean = vec3(from_bits(GATHER_U(cells, at, low[0])), from_bits(GATHER_U(cells, at, low[1])),
-                           from_bits(GATHER_U(cells, at, low[2])));
+    const UInt cell = pick_u(found, slot, (UInt)(0u));
+    const Vec3 mean = vec3(from_bits(GATHER_U(cells, cell, low[0])), from_bits(GATHER_U(cells, cell, low[1])),
+                           from_bits(GATHER_U(cells, cell, low[2])));
     Vec3 light = mul(load_gate(vertices, pixel), mean);
     const Mask alone = wanted & !found;
 #if RESTORE
@@ -278,7 +272,7 @@ static inline void look_up_samples(
 /// Add the light from behind the vertices to the samples of every complete pass: the average of the cell,
 /// or the sample's own where there is none.  One work item W pixels, RUN times, after resolve_cells.
 ///
-/// reads   beyond, vertices, cell_keys, cells, full_buckets, seen
+/// reads   beyond, vertices, cell_keys, cells, full_buckets, seen; with WALLS near_cells, geometry
 /// writes  samples, base, film_lost; counters.unfiltered_samples (atomic)
 kernel void look_up_cells(
     __global const Params *params,
@@ -295,7 +289,7 @@ kernel void look_up_cells(
 #if RESTORE
     __global Lost *film_lost,
 #endif
-    __global float *samples)
+    __global float *samples WALL_BUFFERS)
 {
     const uint first = get_global_id(0) * (W * RUN);
     const uint end = min(first + W * RUN, params->pixel_count);
@@ -311,7 +305,7 @@ kernel void look_up_cells(
 #if RESTORE
                             film_lost,
 #endif
-                            samples + 4 * place.samples, i, &place);
+                            samples + 4 * place.samples, i, &place WALL_ARGUMENTS_OF(near_cells + place.slots));
     }
 }
 

@@ -540,6 +540,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "guiding is off",
         ),
         "CELLS": _cells(settings, glossy),
+        "WALLS": _walls(settings),
         "RESTORE": _restore(settings),
         "SEEN": _seen(settings, outputs),
         "BASE": _base(settings, glossy),
@@ -579,6 +580,15 @@ def _restore(settings: Settings) -> Feature:
     if settings.screen_filter != "off" or settings.temporal != "off":
         return Feature(0, "screen_filter or temporal is on, and goes on with the averages")
     return Feature(1, "filter_restore puts back what averages per cell lost")
+
+
+def _walls(settings: Settings) -> Feature:
+    """Return whether walls inside cells keep light apart."""
+    if settings.path_filter != "hash_grid":
+        return Feature(0, f"path_filter is {settings.path_filter}")
+    if not settings.cell_walls:
+        return Feature(0, "cell_walls is false: light leaks through thin walls")
+    return Feature(1, "cell_walls keeps light apart that a wall inside a cell separates")
 
 
 def _lens(scene: Scene) -> Feature:
@@ -657,7 +667,7 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     # Directions would be drawn otherwise: the image would have other noise.
     full["GUIDE"] = features["GUIDE"]
     if features["METROPOLIS"].value:
-        names = ("AOV_DIRECT", "AOV_FEATURES", "BASE", "CELLS", "RESTORE", "SEEN")
+        names = ("AOV_DIRECT", "AOV_FEATURES", "BASE", "CELLS", "RESTORE", "SEEN", "WALLS")
         full |= {name: features[name] for name in names}
     # Without anything to move there is nothing to hold.
     full["MOTION"] = features["MOTION"]

@@ -1121,10 +1121,12 @@ class Renderer:
         self.cell_launches = [
             (program.bind_planned(name, self.buffers), items)
             for name, items in (
+                ("mark_near_cells", per_pixel),
                 ("store_cells", per_pixel),
                 ("resolve_cells", per_bucket),
                 ("look_up_cells", per_pixel),
             )
+            if name != "mark_near_cells" or self.plan.features["WALLS"].value
         ]
         self.clear_cells = program.bind_planned("clear_cells", self.buffers)
         self.add_unfiltered = program.bind_planned("add_unfiltered", self.buffers)

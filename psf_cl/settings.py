@@ -131,6 +131,9 @@ class Settings:
     cell_near: bool = _switch(
         True, doc="tell light from within a cell apart from light from afar: contacts stay dark"
     )
+    cell_walls: bool = _switch(
+        True, doc="keep light apart that a wall inside a cell separates: short rays look for it"
+    )
     cell_shrink: bool = _switch(
         True, doc="make cells smaller from pass to pass: consistent; else the image stays blurred"
     )

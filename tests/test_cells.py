@@ -165,7 +165,9 @@ def test_a_plane_equals_a_model_of_its_cells(device):
         opened.device.read(opened.buffers[name])[: len(pixels)] for name in ("beyond", "vertices")
     )
     opened.close()
-    low = (beyond["vertex"] & 0x7FFFFFFF == 1) & (np.abs(vertices["p"][:, 1]) < 1e-3)
+    low = (beyond["vertex"] & layout.CONSTANT["VERTEX_MASK"] == 1) & (
+        np.abs(vertices["p"][:, 1]) < 1e-3
+    )
     assert low.sum() > 1500
     gate = vertices["gate"][low].astype(np.float64)
     np.testing.assert_allclose(gate, np.broadcast_to((0.5, 0.6, 0.7), gate.shape), rtol=1e-6)

@@ -493,6 +493,7 @@ def test_plan_follows_the_options(all_features, capsys):
         "TANGENTS",
         "TEMPORAL",
         "VERTEX_COLORS",
+        "WALLS",
     }
     off_by_default = unused | {"AOV_DIRECT", "AOV_FEATURES"}
     assert off == off_by_default and plan["crop"] == [0, 0, 24, 16]

@@ -17,6 +17,15 @@ typedef struct {
     UInt extra;       // told apart in addition; 0 for nothing
 } CellQuery;
 
+/// A cube of the grid, and the side of it that a surface in it faces.
+typedef struct {
+    UInt x;           // counts up along the axis; any bits
+    UInt y;
+    UInt z;
+    UInt level;
+    UInt side;        // 0 to 2 along the axes, 4 to 6 against them
+} CellPlace;
+
 /// Where to look in the table.
 typedef struct {
     UInt bucket;
@@ -56,13 +65,17 @@ static inline Float cell_edge(UInt level) { return from_bits(level << 23); }
 /// Nearest integer as bits that count up with it; far from 0, numbers that differ keep different bits.
 static inline UInt nearest(Float x) { return as_bits(x + 0x1.8p23f); }
 
-/// Return the cell of a point that is moved in its tangent plane by up to half a cell.
+// Walls lie on planes of round numbers: the grid is shifted off these, in edges.
+#define CELL_SHIFT_X 0.13f
+#define CELL_SHIFT_Y -0.11f
+#define CELL_SHIFT_Z -0.33f
+
+/// Return where in the grid a point is; with `jitter` it is moved in its tangent plane by up to half a cell.
 ///
 /// Along the two axes of the grid that the surface faces less, the move is up to half an edge either way.
 /// The level is chosen again after it, or there would be cells of levels that no point that stays has.
-/// Walls lie on planes of round numbers: the grid is shifted off these.  Blocks of 2 x 2 x 2 cells share a
-/// bucket, for neighbours are looked up together.
-static inline CellKey cell_of(__global const Params *params, const CellQuery *q, UInt random_x, UInt random_y)
+static inline CellPlace cell_place(
+    __global const Params *params, const CellQuery *q, UInt random_x, UInt random_y, uint jitter)
 {
     const Float dither = unit_float(mix_bits(random_x ^ rotate(random_y, (UInt)(16u))));
     UInt level = cell_level(q->width, dither);
@@ -76,7 +89,7 @@ static inline CellKey cell_of(__global const Params *params, const CellQuery *q,
     const Mask on_z = !on_x & !on_y;
     const Float nw = pick(on_x, n.x, pick(on_y, n.y, n.z));
     Vec3 p = q->p;
-    if (params->cell_flags & CELL_JITTER) {
+    if (jitter) {
         const Float edge = cell_edge(level);
         const Float du = (unit_float(random_x) - 0.5f) * edge;
         const Float dv = (unit_float(random_y) - 0.5f) * edge;
@@ -89,16 +102,39 @@ static inline CellKey cell_of(__global const Params *params, const CellQuery *q,
         level = cell_level(pick(q->seen, q->width * ratio, q->width), dither);
     }
     const Float inverse = 1.0f / cell_edge(level);
-    const UInt x = nearest(p.x * inverse - 0.13f);
-    const UInt y = nearest(p.y * inverse + 0.11f);
-    const UInt z = nearest(p.z * inverse + 0.33f);
-    const UInt side = pick_u(on_x, (UInt)(0u), pick_u(on_y, (UInt)(1u), (UInt)(2u)))
-                      + pick_u(nw < 0.0f, (UInt)(4u), (UInt)(0u)) + 8u * q->near;
+    CellPlace place;
+    place.x = nearest(p.x * inverse - CELL_SHIFT_X);
+    place.y = nearest(p.y * inverse - CELL_SHIFT_Y);
+    place.z = nearest(p.z * inverse - CELL_SHIFT_Z);
+    place.level = level;
+    place.side = pick_u(on_x, (UInt)(0u), pick_u(on_y, (UInt)(1u), (UInt)(2u)))
+                 + pick_u(nw < 0.0f, (UInt)(4u), (UInt)(0u));
+    return place;
+}
+
+/// Middle of a cube of the grid.
+static inline Vec3 cell_middle(CellPlace place)
+{
+    const Float edge = cell_edge(place.level);
+    return vec3((from_bits(place.x) - 0x1.8p23f + CELL_SHIFT_X) * edge,
+                (from_bits(place.y) - 0x1.8p23f + CELL_SHIFT_Y) * edge,
+                (from_bits(place.z) - 0x1.8p23f + CELL_SHIFT_Z) * edge);
+}
+
+/// Return where in the table what is asked for is; `wall` is 0 or tells apart what a wall separates.
+///
+/// Blocks of 2 x 2 x 2 cells share a bucket, for neighbours are looked up together.
+static inline CellKey cell_key(__global const Params *params, const CellQuery *q, CellPlace place, UInt wall)
+{
+    const UInt x = place.x;
+    const UInt y = place.y;
+    const UInt z = place.z;
+    const UInt side = place.side + 8u * q->near + 16u * wall;
     const UInt corner = (x & 1u) | ((y & 1u) << 1) | ((z & 1u) << 2);
     const UInt index = mix_bits((x >> 1) * 0x9e3779b1u + (y >> 1) * 0x85ebca77u + (z >> 1) * 0xc2b2ae3du
-                                + level * 0x27d4eb2fu + q->extra * 0x165667b1u);
+                                + place.level * 0x27d4eb2fu + q->extra * 0x165667b1u);
     const UInt print = mix_bits_too((x >> 1) * 0x2c1b3c6du + (y >> 1) * 0x297a2d39u + (z >> 1) * 0x9c8f2d35u
-                                    + level * 0x68e31da5u + q->extra * 0xb5297a4du + side * 0x1b56c4e9u);
+                                    + place.level * 0x68e31da5u + q->extra * 0xb5297a4du + side * 0x1b56c4e9u);
     CellKey key;
     key.bucket = bucket_of(index, params->cell_slots);
     // Probing starts at the slot that the last bits name: those of a block are side by side, and what is

@@ -81,6 +81,9 @@
 #ifndef CELLS
 #error "CELLS must be 0, 1 (all of a vertex's light is shared) or 2 (that of its diffuse base)"
 #endif
+#ifndef WALLS
+#error "WALLS must be 0 or 1 (walls inside cells keep light apart)"
+#endif
 #ifndef RESTORE
 #error "RESTORE must be 0 or 1 (what averages per cell take from a pixel is kept apart)"
 #endif

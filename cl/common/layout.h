@@ -44,7 +44,9 @@
 #define FILTER_NONE 0xFFFFFFFFu // no vertex
 #define VERTEX_NEAR 0x80000000u // set if the path met a surface within a cell of its vertex
 #define VERTEX_REJECTED 0x40000000u // set if what was gathered is too large for a cell
-#define VERTEX_MASK 0x3FFFFFFFu // 1 + depth
+#define VERTEX_WALL_SHIFT 24u // first bit of what separates the vertex from where it is stored
+#define VERTEX_WALL_MASK 7u // of that, shifted: 0 nothing, or 1 + the side that a wall faces
+#define VERTEX_MASK 0x001FFFFFu // 1 + depth
 #define CELL_JITTER 1u // points are moved before they are told apart by cells
 #define CELL_NEAR 4u // samples of light from near have cells of their own
 #define CELL_IDENTITY 2u // every sample has a cell of its own: nothing is shared (tests)
@@ -599,7 +601,7 @@ typedef struct {
 /// What a sample gathered behind its cell's vertex.
 typedef struct {
     float radiance[3]; // at the camera
-    uint vertex; // 1 + its depth, VERTEX_NEAR, VERTEX_REJECTED; 0 if there is none
+    uint vertex; // 1 + its depth, VERTEX_NEAR, VERTEX_REJECTED, a wall; 0 if there is none
 } Beyond;
 
 /// What averages per cell took from a pixel: sums over its samples, or a mean and its variance.

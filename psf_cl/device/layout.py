@@ -522,7 +522,7 @@ BEYOND = Record(
     "What a sample gathered behind its cell's vertex.",
     _fields("""
     float radiance[3] - at the camera
-    uint vertex - 1 + its depth, VERTEX_NEAR, VERTEX_REJECTED; 0 if there is none
+    uint vertex - 1 + its depth, VERTEX_NEAR, VERTEX_REJECTED, a wall; 0 if there is none
     """),
 )
 
@@ -850,7 +850,9 @@ CONSTANTS = (
     ("FILTER_NONE", 0xFFFFFFFF, "no vertex"),
     ("VERTEX_NEAR", 0x80000000, "set if the path met a surface within a cell of its vertex"),
     ("VERTEX_REJECTED", 0x40000000, "set if what was gathered is too large for a cell"),
-    ("VERTEX_MASK", 0x3FFFFFFF, "1 + depth"),
+    ("VERTEX_WALL_SHIFT", 24, "first bit of what separates the vertex from where it is stored"),
+    ("VERTEX_WALL_MASK", 7, "of that, shifted: 0 nothing, or 1 + the side that a wall faces"),
+    ("VERTEX_MASK", 0x1FFFFF, "1 + depth"),
     ("CELL_JITTER", 1, "points are moved before they are told apart by cells"),
     ("CELL_NEAR", 4, "samples of light from near have cells of their own"),
     ("CELL_IDENTITY", 2, "every sample has a cell of its own: nothing is shared (tests)"),

@@ -21,6 +21,9 @@ HEADROOM = 1024.0
 #: Knaus, Zwicker: Progressive Photon Mapping: A Probabilistic Approach, 2011 (alpha = 2/3).
 SHRINK_EXPONENT = -1.0 / 6.0
 
+#: Features that the rays that look for walls depend on.
+TRACING = ("WALLS", "FEW", "INSTANCES", "ALPHA", "VERTEX_COLORS")
+
 
 def slots_of(pixel_count: int) -> int:
     """Return the slots of the table of a pass.
@@ -107,6 +110,7 @@ def plan(context: Context) -> StageSpec | None:
     """Return the stage, or None if paths are not filtered."""
     if not context.on("CELLS") or context.range_search:
         return None
+    walls = context.on("WALLS")
     slots = slots_of(context.pixel_count)
     cell, uint32 = layout.CELL.dtype, np.dtype(np.uint32)
     buffers = (
@@ -121,8 +125,13 @@ def plan(context: Context) -> StageSpec | None:
             passing=True,
         ),
     )
+    if walls:
+        what = "cells with light from near"
+        buffers += (BufferSpec("near_cells", uint32, context.ring * slots, what, True),)
     sample_bytes = layout.BEYOND.dtype.itemsize + layout.CELL_VERTEX.dtype.itemsize
+    marks = (KernelSpec("mark_near_cells", record_bytes=sample_bytes, per_sample=True, runs=True),)
     kernels = (
+        *(marks if walls else ()),
         KernelSpec(
             "store_cells",
             record_bytes=sample_bytes + 4 + 2 * cell.itemsize,
@@ -145,8 +154,9 @@ def plan(context: Context) -> StageSpec | None:
         "cells",
         "light is shared by the paths that meet in a cell",
         "cells.cl",
-        flags=("BASE", "CELLS", "RESTORE"),
+        flags=("BASE", "CELLS", "RESTORE", *TRACING),
         kernels=kernels,
         buffers=buffers,
+        traces=True,
         per_pass=True,
     )

@@ -1,0 +1,92 @@
+// Walls inside cells: what they separate must not share light.
+//
+// A short ray goes from the vertex of a sample to the middle of its cell, just above the surface.  Where
+// something is in its way, the sample shares with those alone that see the same side of it: the two sides
+// of a wall never meet, wherever in the cell it stands.  Only cells that have a mark need rays: some path
+// went on from there to a surface within a cell's width.
+#pragma once
+
+#include "lanes.h"
+#include "layout.h"
+#include "cells.h"
+#include "rng.h"
+#include "surface.h"
+#include "trace.h"
+#include "unit_vector.h"
+
+#if WALLS
+// How far above the surface rays go, in edges of the cell.
+#define WALL_LIFT (1.0f / 16.0f)
+
+// What is cut out has the surfaces among its own buffers.
+#if ALPHA
+#define SURFACE_BUFFER
+#define SURFACE_ARGUMENT
+#else
+#define SURFACE_BUFFER , __global const Surface *surfaces
+#define SURFACE_ARGUMENT , surfaces
+#endif
+#define WALL_BUFFERS , __global const uint *near_cells SURFACE_BUFFER, GEOMETRY_BUFFERS
+#define WALL_ARGUMENTS_OF(marks) , marks SURFACE_ARGUMENT, GEOMETRY_BUFFER_ARGUMENTS
+#define WALL_ARGUMENTS WALL_ARGUMENTS_OF(near_cells)
+
+/// Where the mark of a cell is: the number of the pass after that in which something near was met.  Some
+/// cells share a place: a few rays more.
+static inline UInt place_of_mark(__global const Params *params, CellPlace place)
+{
+    const UInt hash = mix_bits(place.x * 0x9e3779b1u + place.y * 0x85ebca77u + place.z * 0xc2b2ae3du
+                               + place.level * 0x27d4eb2fu + place.side * 0x165667b1u);
+    return hash & (params->cell_slots - 1u);
+}
+
+/// Mark the cells of the lanes in `near`.
+static inline void mark_cells(
+    __global const Params *params, __global uint *near_cells, Mask near, CellPlace place, uint pass)
+{
+    uint lane_at[W];
+    store_lanes_u(place_of_mark(params, place), lane_at);
+    for (uint left = lane_bits(near); left; left &= left - 1u)
+        near_cells[lane_at[lowest_bit(left)]] = pass + 1u;
+}
+
+/// Return what separates points from the middles of their cells: 0 for nothing, or 1 + the side of the cube
+/// that what is in between faces.
+LARGE_FUNCTION UInt wall_before(
+    __global const Params *params, Mask mask, const CellQuery *query, CellPlace place, UInt seed WALL_BUFFERS)
+{
+#if ALPHA == 2
+    uint ray_seeds[W];
+    store_lanes_u(seed, ray_seeds);
+#endif
+    const Vec3 n = normalize3(query->ng);
+    const Vec3 from = add_scaled(query->p, n, WALL_LIFT * cell_edge(place.level));
+    Vec3 toward = sub(cell_middle(place), from);
+    // Both ends are as far above the plane of the surface.
+    toward = add_scaled(toward, n, -dot3(toward, n));
+    const Mask blocked = mask & blocked_rays(params, mask, from, toward, GEOMETRY_ARGUMENTS);
+    if (!any_lane(blocked))
+        return (UInt)(0u);
+    const Vec3 direction = normalize3(toward);
+    const Hits hits = closest_hits(params, blocked, from, direction, GEOMETRY_ARGUMENTS);
+    const Mask hit = blocked & (hits.triangle != NO_HIT);
+    const SurfacePoint s = surface_point(pick_u(hit, hits.triangle, (UInt)(0u)), hits.u, hits.v,
+                                         scale(direction, (Float)(-1.0f)), surfaces INSTANCE_ARGUMENTS);
+    return pick_u(hit, 1u + cube_face(s.ng), (UInt)(0u));
+}
+
+/// The same for the lanes of `mask` whose cells have a mark of the pass; 0 for the others.
+static inline UInt wall_in_cell(
+    __global const Params *params, Mask mask, const CellQuery *query, CellPlace place, uint pass, UInt pixel WALL_BUFFERS)
+{
+    const Mask near = mask & (GATHER_WORD(near_cells, place_of_mark(params, place)) == pass + 1u);
+    if (!any_lane(near))
+        return (UInt)(0u);
+    return wall_before(params, near, query, place, mix_bits(pixel * 0x9e3779b9u + pass) WALL_ARGUMENTS);
+}
+
+#else
+#define WALL_BUFFERS
+#define WALL_ARGUMENTS_OF(marks)
+#define WALL_ARGUMENTS
+#define wall_in_cell(params, mask, query, place, pass, pixel) ((UInt)(0u))
+#endif
