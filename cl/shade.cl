@@ -27,7 +27,7 @@ static inline Float emission_weight(__global const Params *params, Mask camera_r
         weight = power_heuristic(pdf_bsdf, pdf_light);
     else if (params->direct_sampling == DIRECT_LIGHT)
         weight = pick(pdf_light > 0.0f, (Float)(0.0f), (Float)(1.0f));
-    return pick(camera_ray, (Float)(1.0f), weight);
+    return pick(camera_ray | (pdf_bsdf >= PDF_DELTA), (Float)(1.0f), weight);
 }
 
 #if SEEN
@@ -329,6 +329,7 @@ kernel void shade_paths(
 #endif
 
     const Mask goes_on = hit & (depth < params->max_depth);
+    const Mask delta = is_delta(b);
 #if SEEN
 #if INSTANCES
     const UInt shape = 1u + ((s.instance * 0x9e3779b1u + GATHER_U(surfaces, s.triangle, shape)) >> 2);
@@ -355,7 +356,7 @@ kernel void shade_paths(
 #if GUIDE
     const UInt noise = mix_bits(mix_bits(get_u(path, PATH_SEED) + depth * 0x9e3779b9u) + sample);
     const Mask learning = alive & (sample < counters[COUNTER_LEARN_LIMIT]);
-    const Mask guided = goes_on & (Mask)(counters[COUNTER_GUIDE_OFF] ? 0 : -1);
+    const Mask guided = goes_on & !delta & (Mask)(counters[COUNTER_GUIDE_OFF] ? 0 : -1);
     const Guide guide =
         find_guide(params, guide_keys, guide_cells, guide_full, counters, guided, learning, s.p, s.ns, noise);
     // What the last ray brought: what this surface emits, and reflects of what its own cell knows of.  What
@@ -428,6 +429,7 @@ kernel void shade_paths(
 
 #if CONNECT
     if (params->light_count > 0u) {
+        const Mask asks = goes_on & !delta;
         const Float away = s.offset;
         const Vec3 above = add_scaled(s.p, s.ng, away);
         LightQuery query;
@@ -447,7 +449,7 @@ kernel void shade_paths(
         for (uint size = 0; size < PARTICLE_SIZES; ++size)
             query.cells[size] = particle_cell(params, near, s.ng, size);
 #endif
-        const LightChoice choice = choose_light(params, lights CHOICE_ARGUMENTS, goes_on, &query, light_bits);
+        const LightChoice choice = choose_light(params, lights CHOICE_ARGUMENTS, asks, &query, light_bits);
 #if LIGHT_PHOTONS
         put_u(path, PATH_PARTICLE_PLACE, query.cells[0].place);
         put_u(path, PATH_PARTICLE_PRINT, query.cells[0].print);
@@ -457,7 +459,7 @@ kernel void shade_paths(
 #if ENVIRONMENT == 2
                                                environment,
 #endif
-                                               goes_on, above, seed, index, pair, choice);
+                                               asks, above, seed, index, pair, choice);
         const Vec3 wi_local = vec3(dot3(tangent, light.wi), dot3(bitangent, light.wi), dot3(s.ns, light.wi));
         Float pdf;
         const Vec3 f = eval_bsdf(b, chances, wo_local, wi_local, dot3(s.ng, light.wi), &pdf);
@@ -469,7 +471,7 @@ kernel void shade_paths(
             weight = pick(light.extended, power_heuristic(light.pdf, pdf), weight);
         else if (params->direct_sampling == DIRECT_BSDF)
             weight = pick(light.extended, (Float)(0.0f), weight);
-        const Mask lit = goes_on & (light.pdf > 0.0f);
+        const Mask lit = asks & (light.pdf > 0.0f);
         const Vec3 arrives =
             mul(mul(beta, f), scale(light.radiance, weight / pick(lit, light.pdf, (Float)(1.0f))));
         put_v(path, PATH_LIGHT_R, pick_v(lit, arrives, zero));
@@ -550,7 +552,7 @@ kernel void shade_paths(
     put_v(path, PATH_BETA_R, beta);
     put_v(path, PATH_ORIGIN_X, ray_origin(s, wi));
     put_v(path, PATH_DIRECTION_X, wi);
-    FIELD(path, PATH_PDF) = pdf;
+    FIELD(path, PATH_PDF) = pick(delta, (Float)(PDF_DELTA), pdf);
     const UInt next = pick_u(survives, STATUS_ALIVE | (depth + 1u), STATUS_DONE | depth);
     put_u(path, PATH_STATUS, pick_u(alive, next, status));
 }

@@ -29,6 +29,9 @@
 // Below this a lobe is sharper than float can evaluate; roughness 0 is drawn with it.
 #define ALPHA_GGX_MIN 1e-3f
 
+// Stands for the density of directions that no light is sampled for: those of delta lobes.
+#define PDF_DELTA 1e30f
+
 /// Chance of each lobe and what all of them share, for one wo.
 typedef struct {
 #if GLOSSY
@@ -70,6 +73,8 @@ static inline Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Floa
 }
 
 static inline Float left_of_choice(LobeChances chances, Float u_lobe) { return u_lobe; }
+
+static inline Mask is_delta(Bsdf b) { return !MASK_ALL; }
 #endif
 
 /// Cosine-weighted direction about z: Malley's method.
@@ -343,6 +348,22 @@ LARGE_FUNCTION LobeChances lobe_chances(Bsdf b, Float cos_o)
     c.coat = above * norm;
 #endif
     return c;
+}
+
+/// Whether all lobes are as sharp as they can be: mirrors and clear glass, for which only their own
+/// directions count.  A sharp lobe over a base is an ordinary one.
+static inline Mask is_delta(Bsdf b)
+{
+    Float base = (1.0f - b.metallic) * max3(b.base_color);
+#if TRANSMISSION
+    base *= 1.0f - b.transmission;
+#endif
+    Mask sharp = (base == 0.0f) & (b.alpha <= ALPHA_GGX_MIN);
+#if LAYERS
+    sharp &= (b.alpha_y <= ALPHA_GGX_MIN) & ((b.coat == 0.0f) | (b.coat_alpha <= ALPHA_GGX_MIN));
+    sharp &= max3(b.sheen) == 0.0f;
+#endif
+    return sharp;
 }
 
 // Alphas along x and y.
