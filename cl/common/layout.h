@@ -89,7 +89,7 @@
 #define PATH_DIRECT_R 16u // of that, what light reflected at most once brought
 #define PATH_DIRECT_G 17u
 #define PATH_DIRECT_B 18u
-#define PATH_PDF 19u // solid-angle density of the ray's direction; PDF_DELTA if lights are not sampled for it
+#define PATH_PDF 19u // solid-angle density of the direction; PDF_DELTA if lights are not sampled for it
 #define PATH_STATUS 20u // uint; STATUS_* bits and the depth
 #define PATH_SAMPLE 21u // uint; index of the sample, which is its pass
 #define PATH_PIXEL 22u // uint; position in the order of pixels

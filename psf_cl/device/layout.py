@@ -638,7 +638,7 @@ PATH_FIELDS = (
     ("direct_r", "of that, what light reflected at most once brought"),
     ("direct_g", ""),
     ("direct_b", ""),
-    ("pdf", "solid-angle density of the ray's direction; PDF_DELTA if lights are not sampled for it"),
+    ("pdf", "solid-angle density of the direction; PDF_DELTA if lights are not sampled for it"),
     ("status", "uint; STATUS_* bits and the depth"),
     ("sample", "uint; index of the sample, which is its pass"),
     ("pixel", "uint; position in the order of pixels"),
