@@ -24,7 +24,10 @@ static inline void add_sample(FilmSum *sum, float4 sample)
     const float y = LUMINANCE_RED * sample.x + LUMINANCE_GREEN * sample.y + LUMINANCE_BLUE * sample.z;
     const float delta = y - sum->mean;
     sum->mean += delta / (float)sum->count;
-    sum->squares = min(sum->squares + delta * (y - sum->mean), FLT_MAX);
+    const float more = delta * (y - sum->mean) - sum->lost_squares;
+    const float squares = min(sum->squares + more, FLT_MAX);
+    sum->lost_squares = (squares - sum->squares) - more;
+    sum->squares = squares;
 }
 
 /// Add every complete pass to the film.  One work item W sums: mostly there is nothing to add.

@@ -122,6 +122,23 @@ def test_sums_go_on_growing_when_a_sample_is_far_below_their_last_digit(film):
     np.testing.assert_allclose(sums_of(found), np.tile(expected, (8, 1)), rtol=0, atol=2e-3)
 
 
+def test_nothing_stalls_beyond_two_to_the_24_samples(film):
+    """A float has steps of 4 there, and these samples are 0 and 2."""
+    f, before = film(8, ring=8), 1 << 25
+    state = np.zeros(8, layout.FILM_SUM.dtype)
+    state["sum"], state["count"], state["mean"], state["squares"] = before, before, 1.0, before
+    f.device.write(f.buffers["film"], state)
+    for start in range(0, 800, 8):
+        for k in range(start, start + 8):
+            f.put(k, [2.0 * (k % 2)] * 3 + [1])
+        f.launch()
+    (found,) = f.read()
+    np.testing.assert_array_equal(found["count"], before + 800)
+    np.testing.assert_array_equal(sums_of(found), before + 800)
+    squares = found["squares"].astype(np.float64) - found["lost_squares"]
+    np.testing.assert_allclose(squares, before + 800, rtol=0, atol=1)
+
+
 def hand_in(device, radiance, direct):
     """Let regenerate_paths hand in finished paths; return both rings and the rejected samples."""
     traits, count = device.traits, len(radiance)

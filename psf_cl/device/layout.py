@@ -425,7 +425,8 @@ FILM_SUM = Record(
     float lost[3] - what the sums lost by rounding
     float mean - running mean of the luminance
     float squares - sum of squared deviations from it
-    float pad[3] - fills the record
+    float lost_squares - what that sum lost by rounding
+    float pad[2] - fills the record
     """),
 )
 
