@@ -14,8 +14,10 @@ import pytest
 from scene_builder import build, camera, floor, glowing, inside_out, lambertian, render, renderer
 
 from psf_cl.scene import primitives, transform
+from psf_cl.scene.animation import world_transforms
+from psf_cl.scene.curve import Curve
 from psf_cl.scene.far import far_from_origin, moved
-from psf_cl.scene.model import Material
+from psf_cl.scene.model import Material, Node, Skin, View
 from psf_cl.settings import PRESETS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -64,6 +66,53 @@ def test_a_scene_a_thousand_kilometers_away_looks_as_it_does_at_home(device):
     assert "m away from the origin" in opened.notes[0]
     np.testing.assert_allclose(opened.image().rgb, at_home.rgb, rtol=1e-3, atol=1e-4)
     opened.close()
+
+
+@pytest.mark.parametrize("away", [[1e5, -1e5, 0.7e5], [0.0, 0.0, 1e6]])
+def test_a_sequence_far_away_looks_as_it_does_at_home(device, away):
+    """The box goes round the lamp's foot on a node below a node, seen by a camera that moves."""
+    scene = lit_floor()
+    times = np.array([0.0, 1.0])
+    steps = Curve(times, np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.2]]))
+    aims = Curve(times, np.array([[0.0, 0.3, 0.0], [0.1, 0.2, 0.0]]))
+    eyes = Curve(times, np.array([[0.0, 1.5, 3.0], [0.3, 1.4, 2.8]]))
+    shapes = (scene.shapes[0], dataclasses.replace(scene.shapes[1], node=2), scene.shapes[2])
+    nodes = (
+        Node(curves={"translation": steps}),
+        Node(matrix=np.diag([0.5, 0.5, 0.5, 1.0])),
+        Node(parent=0, scale=(0.4, 0.4, 0.4)),
+    )
+    view = View(eyes, aims, (0.0, 1.0, 0.0))
+    cameras = (dataclasses.replace(scene.cameras[0], view=view),)
+    scene = dataclasses.replace(scene, shapes=shapes, nodes=nodes, cameras=cameras)
+    middle = far_from_origin(moved(scene, away))
+    frames = []
+    for one in (moved(scene, -(middle - away)), moved(scene, away)):
+        opened = renderer(device, one)
+        opened.render(spp=8)
+        opened.set_frame(1.0)
+        opened.render(spp=8)
+        frames.append(opened.image().rgb)
+        notes = opened.notes
+        opened.close()
+    assert "m away from the origin" in notes[0]
+    np.testing.assert_allclose(frames[1], frames[0], rtol=2e-3, atol=2e-4)
+
+
+def test_far_away_skins_and_matrices_go_along_with_their_nodes():
+    joints = (Node(translation=(1.0, 0.0, 0.0)), Node(parent=0, translation=(0.0, 2.0, 0.0)))
+    nodes = (*joints, Node(matrix=transform.translation((0.0, 0.0, 3.0))))
+    inverse_bind = np.tile(np.eye(4), (2, 1, 1))
+    skinned = dataclasses.replace(lit_floor().shapes[0], skin=Skin((0, 1), inverse_bind))
+    scene = dataclasses.replace(lit_floor(), shapes=(skinned,), nodes=nodes)
+    away = np.array([1e5, 2e5, -1e5])
+    far = moved(scene, away)
+    shift = transform.translation(away)
+    at_home, there = (world_transforms(s.nodes, None) for s in (scene, far))
+    np.testing.assert_allclose(there, shift @ at_home, atol=1e-9)
+    np.testing.assert_array_equal(far.shapes[0].transform, skinned.transform)
+    # One joint leaves the floor at y = 0, the other lifts it to 2.
+    np.testing.assert_allclose(far_from_origin(far), away + (1.0, 1.0, 0.0), atol=1e-9)
 
 
 @pytest.mark.parametrize("place", [(0.2, -1.0, 0.3), (-1.0, -1.0, -1.0)], ids=["wall", "corner"])
