@@ -112,7 +112,7 @@ def test_far_away_skins_and_matrices_go_along_with_their_nodes():
     np.testing.assert_allclose(there, shift @ at_home, atol=1e-9)
     np.testing.assert_array_equal(far.shapes[0].transform, skinned.transform)
     # One joint leaves the floor at y = 0, the other lifts it to 2.
-    np.testing.assert_allclose(far_from_origin(far), away + (1.0, 1.0, 0.0), atol=1e-9)
+    np.testing.assert_allclose(far_from_origin(far), np.add(away, (1.0, 1.0, 0.0)), atol=1e-9)
 
 
 @pytest.mark.parametrize("place", [(0.2, -1.0, 0.3), (-1.0, -1.0, -1.0)], ids=["wall", "corner"])

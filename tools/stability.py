@@ -117,7 +117,13 @@ def is_biased(settings: Settings) -> bool:
     )
 
 
-def picture(device: Device, scene: Scene, settings: Settings, spp: int) -> Picture:
+def picture(
+    device: Device,
+    scene: Scene,
+    settings: Settings,
+    spp: int,
+    prepare: Callable[[Renderer], None] = lambda renderer: None,
+) -> Picture:
     """Render and sum up; where samples belong to no pixel, in parts that differ by their noise.
 
     Raises:
@@ -125,11 +131,13 @@ def picture(device: Device, scene: Scene, settings: Settings, spp: int) -> Pictu
         DeviceError, InputError: as the renderer does.
     """
     if settings.integrator != "metropolis":
-        return part_of(device, scene, settings, spp, ("variance",))
+        return part_of(device, scene, settings, spp, ("variance",), prepare)
     seeds = range(settings.seed, settings.seed + SEEDS)
     part_spp = max(spp // SEEDS, 1)
     parts = [
-        part_of(device, scene, dataclasses.replace(settings, seed=seed % 2**32), part_spp)
+        part_of(
+            device, scene, dataclasses.replace(settings, seed=seed % 2**32), part_spp, (), prepare
+        )
         for seed in seeds
     ]
     means = [part.mean for part in parts]
@@ -146,10 +154,16 @@ def picture(device: Device, scene: Scene, settings: Settings, spp: int) -> Pictu
 
 
 def part_of(
-    device: Device, scene: Scene, settings: Settings, spp: int, outputs: tuple[str, ...] = ()
+    device: Device,
+    scene: Scene,
+    settings: Settings,
+    spp: int,
+    outputs: tuple[str, ...] = (),
+    prepare: Callable[[Renderer], None] = lambda renderer: None,
 ) -> Picture:
     """Render once and sum up; errors are those of ``picture``."""
     with contextlib.closing(Renderer(scene, settings, device, outputs=outputs)) as renderer:
+        prepare(renderer)
         start = time.process_time()
         if not renderer.render(
             spp=spp, progress=lambda now: time.process_time() - start < MOST_SECONDS
@@ -210,7 +224,8 @@ class Bench:
 
     def render(self, case: Case, preset: str, factor: float = 1.0) -> Picture:
         spp = case.own_spp or max(round(self.spp * case.spp * factor), 1)
-        return picture(self.device, self.scene(case), self.settings(case, preset), spp)
+        settings = self.settings(case, preset)
+        return picture(self.device, self.scene(case), settings, spp, case.prepare)
 
     def truth(self, case: Case) -> tuple[float, float, float]:
         """Return mean, its standard error and the largest pixel of what the case looks like."""

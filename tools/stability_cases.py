@@ -13,11 +13,19 @@ from typing import Any
 
 import numpy as np
 
+from psf_cl.device.layout import COUNTER_INDEX
+from psf_cl.renderer import Renderer
 from psf_cl.scene import primitives, transform
-from psf_cl.scene.model import Camera, Environment, Material, Mesh, Scene, Shape
+from psf_cl.scene.curve import Curve
+from psf_cl.scene.far import moved
+from psf_cl.scene.model import Camera, Environment, Material, Mesh, Node, Scene, Shape
 
 #: Bounces of furnaces: enough that what is left out would show.
 LONG = 1000
+
+#: Of all that have cells.
+TINY_CELLS = {"cell_size": 1e-3, "guide_cell_size": 1e-3, "photon_cell": 1e-6}
+HUGE_CELLS = dict.fromkeys(TINY_CELLS, 1e6)
 
 Part = tuple[Mesh, np.ndarray, Material]
 
@@ -37,6 +45,7 @@ class Case:
         size: of the picture, if it is not to be the usual one.
         fireflies: largest pixel at most, as a multiple of that of the picture that looks the same;
             None if nothing is known about it.
+        prepare: what is done with the renderer before it renders.
     """
 
     name: str
@@ -50,6 +59,7 @@ class Case:
     tolerance: float = 0.0
     size: tuple[int, int] | None = None
     fireflies: float | None = 4.0
+    prepare: Callable[[Renderer], None] = lambda renderer: None
 
 
 def grey(value: float) -> tuple[float, float, float]:
@@ -130,7 +140,8 @@ def room_case(name: str, calm: str | None = "room", **values: Any) -> Case:
     """Return a case of the room; ``values`` are those of ``Case``, the rest of ``room``."""
     known = {item.name for item in dataclasses.fields(Case)}
     own = {key: values.pop(key) for key in [*values] if key in known}
-    return Case(name, lambda edge: room(edge, **values), own.pop("truth", "room"), calm, **own)
+    own.setdefault("scene", lambda edge: room(edge, **values))
+    return Case(name, truth=own.pop("truth", "room"), calm=calm, **own)
 
 
 def sliced(mesh: Mesh, cuts: int = 40) -> Mesh:
@@ -233,6 +244,34 @@ def with_dim_light(parts: dict[str, Part]) -> dict[str, Part]:
 def without_light(parts: dict[str, Part]) -> dict[str, Part]:
     """Take the lamp away."""
     return {name: part for name, part in parts.items() if name != "lamp"}
+
+
+def room_that_moves(edge: int, by: float = 0.0) -> Scene:
+    """Return the room with a ball that comes to its place after a second, moved by a distance."""
+    scene = room(edge)
+    walls, ball, lamp = scene.shapes
+    way = Curve(np.array([0.0, 1.0]), np.array([[-0.5, 0.2, 0.3], [0.0, 0.0, 0.0]]))
+    nodes = (Node(curves={"translation": way}), Node(parent=0, matrix=ball.transform))
+    shapes = (walls, lamp, dataclasses.replace(ball, node=1))
+    away = np.array([by, -by, 0.7 * by])
+    return moved(dataclasses.replace(scene, shapes=shapes, nodes=nodes), away)
+
+
+def after_a_second(renderer: Renderer) -> None:
+    """Render a frame, and begin the one a second later."""
+    renderer.render(spp=1)
+    renderer.set_frame(1.0)
+
+
+def after_passes(count: int) -> Callable[[Renderer], None]:
+    """Return what begins a frame as if ``count`` passes had gone before."""
+
+    def begin(renderer: Renderer) -> None:
+        counted = np.array([count], np.uint32)
+        renderer.device.write(renderer.buffers["counters"], counted, COUNTER_INDEX["film_pass"])
+        renderer.set_frame(0.0)
+
+    return begin
 
 
 # Furnaces: a closed room of one albedo whose walls glow such that all of it has the radiance 1.
@@ -347,18 +386,35 @@ CASES: tuple[Case, ...] = (
     furnace_case("1x1 pixel", None, depth=3, size=(1, 1), spp=16),
     furnace_case("8192x64 pixels", depth=3, size=(8192, 64), spp=0.05),
     furnace_case("1e6 samples of a pixel", None, depth=1, size=(1, 1), own_spp=10**6),
-    furnace_case("tiny cells", None, depth=3, settings={"cell_size": 1e-3}),
-    furnace_case("huge cells", None, depth=3, settings={"cell_size": 1e6}),
+    # Samples are counted from pass to pass and from frame to frame.
+    room_case("beyond 2^24 passes", None, prepare=after_passes(2**24 - 8)),
+    room_case("a frame later", None, scene=room_that_moves, prepare=after_a_second),
+    room_case(
+        "a frame later, 1e5 m away",
+        None,
+        scene=lambda edge: room_that_moves(edge, 1e5),
+        prepare=after_a_second,
+    ),
+    furnace_case("tiny cells", None, depth=3, settings=TINY_CELLS),
+    furnace_case("huge cells", None, depth=3, settings=HUGE_CELLS),
+    room_case("tiny cells in the room", None, settings=TINY_CELLS),
+    # As many slots as samples, all of which want one.
     furnace_case(
-        "a cell a sample, a table full", None, depth=3, size=(64, 64), settings={"cell_size": 1e-3}
+        "a cell a sample, a table full", None, depth=3, size=(64, 64), settings=TINY_CELLS
     ),
     furnace_case("a table of one slot", None, depth=3, size=(1, 1), spp=16),
+    # The guide learns by means, which have no rate: what it may decide goes from nothing to all.
+    room_case("what was learned decides nothing", None, settings={"guide_share": 0.0}),
+    room_case("what was learned decides 99 %", None, settings={"guide_share": 0.99}),
+    room_case("1 photon", None, settings={"photons": 1}),
+    room_case("1e7 photons", None, settings={"photons": 10**7}, spp=0.1),
     ball_case("glass", glass(), "glass"),
     ball_case("glass of index 1", glass(1.0), "glass"),
     ball_case("glass of index 1.0001", glass(1.0001), "glass"),
     ball_case("glass of index 5", glass(5.0), None),
     ball_case("glass of roughness 1e-4", glass(1.5, 1e-4), "glass"),
     ball_case("nested glass", glass(), None, radii=(1.0, 0.7, 0.4)),
+    ball_case("camera inside of glass", glass(), None, view=camera((0.5, 0, 0), (0, 0, 0))),
     ball_case("metal", metal(0.3), "metal", tolerance=0.01),
     ball_case("metal of roughness 0", metal(0.0), "metal"),
     ball_case("metal of roughness 1e-4", metal(1e-4), "metal"),
