@@ -68,6 +68,31 @@ kernel void take_lost(
     unrestored[pixel].difference = variance * (1.0f + 4.0f / max(count - 1.0f, 1.0f));
 }
 
+/// Sum over the pixels of a row, or `down` a column, at most `radius` away; return the sum of variances.
+static inline Float sum_line(
+    __global const Params *params,
+    __global const Lost *lost,
+    UInt column,
+    UInt row,
+    const uint radius,
+    const bool down,
+    Vec3 *sum)
+{
+    const UInt here = down ? row : column;
+    const uint extent = down ? params->crop_height : params->crop_width;
+    *sum = vec3_all((Float)(0.0f));
+    Float variance = (Float)(0.0f);
+    for (uint k = 0; k <= 2u * radius; ++k) {
+        // Before the first pixel this wraps around, to beyond the last.
+        const Mask inside = here + k - radius < extent;
+        const UInt there = pick_u(inside, here + k - radius, here);
+        const UInt at = down ? pixel_entry(params, column, there) : pixel_entry(params, there, row);
+        *sum = add(*sum, pick_v(inside, gather_lost(lost, at), vec3_all((Float)(0.0f))));
+        variance += pick(inside, GATHER(lost, at, difference), (Float)(0.0f));
+    }
+    return variance;
+}
+
 /// Sum what is left over windows of a row, `radius` pixels to either side.  One work item W pixels.
 ///
 /// reads   unrestored
@@ -83,15 +108,8 @@ kernel void sum_rows(
     UInt column;
     UInt row;
     place_in_crop(params, pixel, &column, &row);
-    Vec3 sum = vec3_all((Float)(0.0f));
-    Float variance = (Float)(0.0f);
-    for (uint k = 0; k <= 2u * radius; ++k) {
-        const UInt x = column + k - radius;
-        const Mask inside = x < params->crop_width;
-        const UInt at = pixel_entry(params, pick_u(inside, x, column), row);
-        sum = add(sum, pick_v(inside, gather_lost(unrestored, at), vec3_all((Float)(0.0f))));
-        variance += pick(inside, GATHER(unrestored, at, difference), (Float)(0.0f));
-    }
+    Vec3 sum;
+    const Float variance = sum_line(params, unrestored, column, row, radius, false, &sum);
     float lane[4][W];
     store_lanes(sum.x, lane[0]);
     store_lanes(sum.y, lane[1]);
@@ -121,15 +139,8 @@ kernel void restore_windows(
     UInt column;
     UInt row;
     place_in_crop(params, pixel, &column, &row);
-    Vec3 sum = vec3_all((Float)(0.0f));
-    Float variance = (Float)(0.0f);
-    for (uint k = 0; k <= 2u * radius; ++k) {
-        const UInt y = row + k - radius;
-        const Mask inside = y < params->crop_height;
-        const UInt at = pixel_entry(params, column, pick_u(inside, y, row));
-        sum = add(sum, pick_v(inside, gather_lost(rows, at), vec3_all((Float)(0.0f))));
-        variance += pick(inside, GATHER(rows, at, difference), (Float)(0.0f));
-    }
+    Vec3 sum;
+    const Float variance = sum_line(params, rows, column, row, radius, true, &sum);
     const UInt wide = min(column + radius, (UInt)(params->crop_width - 1u)) - (column - min(column, (UInt)(radius)));
     const UInt high = min(row + radius, (UInt)(params->crop_height - 1u)) - (row - min(row, (UInt)(radius)));
     const Float inverse = 1.0f / to_float((wide + 1u) * (high + 1u));
