@@ -50,6 +50,11 @@ kernel void mark_near_cells(
 }
 #endif
 
+#if AOV_CELLS
+/// Steps of the sum of (luminance / cell_limit)^2 of as many samples as there are pixels.
+static inline Float square_steps(__global const Params *params) { return (Float)(0x1p63f / (float)params->cell_slots); }
+#endif
+
 /// Add what W samples gathered behind their vertices to cells.
 static inline void store_samples(
     __global const Params *params,
@@ -58,6 +63,9 @@ static inline void store_samples(
     volatile __global uint *counters,
     volatile __global uint *keys,
     volatile __global Cell *cells,
+#if AOV_CELLS
+    volatile __global CellSquares *squares,
+#endif
     __global uint *full_buckets,
     uint first,
     const PassPlace *place WALL_BUFFERS)
@@ -101,6 +109,16 @@ static inline void store_samples(
         store_lanes_u(high, lane_high[c]);
         random = mix_bits(random + 0x9e3779b9u);
     }
+#if AOV_CELLS
+    const Float part = luminance(light) / params->cell_limit;
+    UInt square_low;
+    UInt square_high;
+    to_fixed(part * part, square_steps(params), unit_float(random), &square_low, &square_high);
+    uint lane_square_low[W];
+    uint lane_square_high[W];
+    store_lanes_u(square_low, lane_square_low);
+    store_lanes_u(square_high, lane_square_high);
+#endif
     uint lane_bucket[W];
     uint lane_key[W];
     store_lanes_u(key.bucket, lane_bucket);
@@ -117,6 +135,10 @@ static inline void store_samples(
             failed += popcount(same);
         } else {
             add_lanes(&cells[slot], same, lane_low, lane_high);
+#if AOV_CELLS
+            const ulong square = sum_lanes(same, lane_square_low, lane_square_high);
+            add_fixed(&squares[slot].low, &squares[slot].high, (uint)square, (uint)(square >> 32));
+#endif
         }
     }
     if (failed != 0u)
@@ -130,7 +152,7 @@ static inline void store_samples(
 /// left out, and marked.  Both are counted.
 ///
 /// reads   beyond, vertices, counters; with WALLS near_cells, geometry
-/// writes  cell_keys, cells, full_buckets, beyond.vertex, counters.{failed_inserts, rejected_cells} (atomic)
+/// writes  cell_keys, cells, cell_squares, full_buckets, beyond.vertex, counters.{failed_inserts, rejected_cells} (atomic)
 kernel void store_cells(
     __global const Params *params,
     __global Beyond *beyond,
@@ -138,6 +160,9 @@ kernel void store_cells(
     volatile __global uint *counters,
     volatile __global uint *cell_keys,
     volatile __global Cell *cells,
+#if AOV_CELLS
+    volatile __global CellSquares *cell_squares,
+#endif
     __global uint *full_buckets WALL_BUFFERS)
 {
     const uint first = get_global_id(0) * (W * RUN);
@@ -147,8 +172,11 @@ kernel void store_cells(
         const PassPlace place = place_of(params, counters[COUNTER_FILM_PASS] + k);
         for (uint i = first; i < end; i += W)
             store_samples(params, beyond + place.samples, vertices + place.samples, counters,
-                          cell_keys + place.slots, cells + place.slots, full_buckets + place.buckets, i,
-                          &place WALL_ARGUMENTS_OF(near_cells + place.slots));
+                          cell_keys + place.slots, cells + place.slots,
+#if AOV_CELLS
+                          cell_squares + place.slots,
+#endif
+                          full_buckets + place.buckets, i, &place WALL_ARGUMENTS_OF(near_cells + place.slots));
     }
 }
 
@@ -156,11 +184,14 @@ kernel void store_cells(
 /// store_cells and look_up_cells.
 ///
 /// reads   cell_keys, counters
-/// writes  cells
+/// writes  cells, cell_squares
 kernel void resolve_cells(
     __global const Params *params,
     const volatile __global uint *counters,
     __global const uint *cell_keys,
+#if AOV_CELLS
+    __global CellSquares *cell_squares,
+#endif
     __global Cell *cells)
 {
     const uint size = bucket_size(params->cell_slots);
@@ -180,9 +211,48 @@ kernel void resolve_cells(
             const float inverse = 1.0f / (params->cell_steps * (float)cell->count);
             for (uint c = 0; c < 3; ++c)
                 cell->low[c] = as_uint(((float)cell->high[c] * 0x1p32f + (float)cell->low[c]) * inverse);
+#if AOV_CELLS
+            __global CellSquares *square = &cell_squares[at + i];
+            const float mean = 0.2126f * as_float(cell->low[0]) + 0.7152f * as_float(cell->low[1])
+                               + 0.0722f * as_float(cell->low[2]);
+            const float sum = (float)square->high * 0x1p32f + (float)square->low;
+            const float limit = params->cell_limit;
+            const float second = sum * (0x1p-63f * (float)params->cell_slots) * limit / (float)cell->count * limit;
+            square->low = as_uint(max(second - mean * mean, 0.0f));
+#endif
         }
     }
 }
+
+#if AOV_CELLS
+/// Add what a sample saw of the cell in `slot` to what its pixel did; nothing if there is none.
+static inline void view_cell(
+    __global CellView *view,
+    __global const Cell *cells,
+    __global const CellSquares *squares,
+    __global const uint *keys,
+    uint slot,
+    uint size,
+    int is_first)
+{
+    if (slot == NO_SLOT)
+        return;
+    const uint bucket = slot & ~(size - 1u);
+    uint taken = 0;
+    for (uint i = 0; i < size; ++i)
+        taken += keys[bucket + i] != 0u;
+    view->occupancy += (float)taken / (float)size;
+    view->count += (float)cells[slot].count;
+    view->variance += as_float(squares[slot].low);
+    view->weight += 1.0f;
+    // The slot with the key, for keys of different buckets may be the same.
+    uint bits = keys[slot] * 0x9e3779b9u + slot * 0x85ebca77u;
+    for (uint c = 0; is_first && c < 3; ++c) {
+        bits = (bits ^ (bits >> 15)) * 0x2c1b3c6du;
+        view->color[c] = (float)(bits >> 8) * 5.9604645e-8f;
+    }
+}
+#endif
 
 /// Add the light from behind the vertices to W samples.
 static inline void look_up_samples(
@@ -192,6 +262,10 @@ static inline void look_up_samples(
     volatile __global uint *counters,
     __global const uint *keys,
     __global const Cell *cells,
+#if AOV_CELLS
+    __global const CellSquares *squares,
+    __global CellView *views,
+#endif
     __global const uint *full_buckets,
 #if BASE
     __global const Seen *seen,
@@ -246,6 +320,10 @@ static inline void look_up_samples(
     store_lanes(lost.z, lane_lost[2]);
     store_lanes(brightness, lane_lost[3]);
 #endif
+#if AOV_CELLS
+    uint lane_slot[W];
+    store_lanes_u(slot, lane_slot);
+#endif
     float lane_light[3][W];
     store_lanes(light.x, lane_light[0]);
     store_lanes(light.y, lane_light[1]);
@@ -263,6 +341,10 @@ static inline void look_up_samples(
             vstore4(vload4(0, sums) + all, 0, sums);
         }
 #endif
+#if AOV_CELLS
+        if (before.w > 0.0f)
+            view_cell(&views[first + i], cells, squares, keys, lane_slot[i], size, place->pass == params->first_pass);
+#endif
 #if BASE
         vstore4(vload4(first + i, base) + more * base_share_of(beyond, seen, first + i), first + i, base);
 #endif
@@ -273,7 +355,7 @@ static inline void look_up_samples(
 /// or the sample's own where there is none.  One work item W pixels, RUN times, after resolve_cells.
 ///
 /// reads   beyond, vertices, cell_keys, cells, full_buckets, seen; with WALLS near_cells, geometry
-/// writes  samples, base, film_lost; counters.unfiltered_samples (atomic)
+/// writes  samples, base, film_lost, film_cells; counters.unfiltered_samples (atomic)
 kernel void look_up_cells(
     __global const Params *params,
     __global const Beyond *beyond,
@@ -281,6 +363,10 @@ kernel void look_up_cells(
     volatile __global uint *counters,
     __global const uint *cell_keys,
     __global const Cell *cells,
+#if AOV_CELLS
+    __global const CellSquares *cell_squares,
+    __global CellView *film_cells,
+#endif
     __global const uint *full_buckets,
 #if BASE
     __global const Seen *seen,
@@ -298,7 +384,11 @@ kernel void look_up_cells(
         const PassPlace place = place_of(params, counters[COUNTER_FILM_PASS] + k);
         for (uint i = first; i < end; i += W)
             look_up_samples(params, beyond + place.samples, vertices + place.samples, counters,
-                            cell_keys + place.slots, cells + place.slots, full_buckets + place.buckets,
+                            cell_keys + place.slots, cells + place.slots,
+#if AOV_CELLS
+                            cell_squares + place.slots, film_cells,
+#endif
+                            full_buckets + place.buckets,
 #if BASE
                             seen + place.samples, base + 4 * place.samples,
 #endif
@@ -312,12 +402,15 @@ kernel void look_up_cells(
 /// Empty the tables of every complete pass and count what was in them.  One work item a bucket.
 ///
 /// reads   counters
-/// writes  cell_keys, cells, full_buckets; counters.{cells_used, cell_probes} (atomic)
+/// writes  cell_keys, cells, cell_squares, full_buckets; counters.{cells_used, cell_probes} (atomic)
 kernel void clear_cells(
     __global const Params *params,
     volatile __global uint *counters,
     __global uint *cell_keys,
     __global Cell *cells,
+#if AOV_CELLS
+    __global CellSquares *cell_squares,
+#endif
     __global uint *full_buckets)
 {
     const uint size = bucket_size(params->cell_slots);
@@ -340,6 +433,9 @@ kernel void clear_cells(
             probes += probes_before(i, size, key) + 1u;
             cell_keys[at + i] = 0u;
             vstore8((uint8)(0u), at + i, (__global uint *)cells);
+#if AOV_CELLS
+            vstore2((uint2)(0u), at + i, (__global uint *)cell_squares);
+#endif
         }
         full_buckets[place.buckets + bucket] = 0u;
     }

@@ -25,8 +25,8 @@ _LETTERS = {"normal": "XYZ", "depth": "Z"}
 _LETTERS_BY_COUNT = {1: "Y", 2: "XY", 3: "RGB", 4: "RGBA"}
 _LETTER_ORDER = "RGBAXYZ"
 
-# Half floats count to 2048 only; these two stay float.
-_ALWAYS_FLOAT = ("depth", "samples")
+# Half floats count to 2048 only; these stay float.
+_ALWAYS_FLOAT = ("depth", "samples", "cell_count", "cell_variance")
 _HALF_MAX = 65504.0
 
 # Stats that are the same for the same render, so that equal images are equal files.

@@ -541,6 +541,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
         ),
         "CELLS": _cells(settings, glossy),
         "WALLS": _walls(settings),
+        "AOV_CELLS": _aov_cells(settings, outputs),
         "RESTORE": _restore(settings),
         "SEEN": _seen(settings, outputs),
         "BASE": _base(settings, glossy),
@@ -580,6 +581,16 @@ def _restore(settings: Settings) -> Feature:
     if settings.screen_filter != "off" or settings.temporal != "off":
         return Feature(0, "screen_filter or temporal is on, and goes on with the averages")
     return Feature(1, "filter_restore puts back what averages per cell lost")
+
+
+def _aov_cells(settings: Settings, outputs: frozenset[str]) -> Feature:
+    """Return whether pixels keep what they saw of cells."""
+    asked = sorted(outputs & set(cells.VIEWS))
+    if settings.path_filter != "hash_grid":
+        return Feature(0, f"path_filter is {settings.path_filter}")
+    if not asked:
+        return Feature(0, "no image of cells was asked for")
+    return Feature(1, f"{', '.join(asked)} asked for")
 
 
 def _walls(settings: Settings) -> Feature:
@@ -667,7 +678,16 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     # Directions would be drawn otherwise: the image would have other noise.
     full["GUIDE"] = features["GUIDE"]
     if features["METROPOLIS"].value:
-        names = ("AOV_DIRECT", "AOV_FEATURES", "BASE", "CELLS", "RESTORE", "SEEN", "WALLS")
+        names = (
+            "AOV_CELLS",
+            "AOV_DIRECT",
+            "AOV_FEATURES",
+            "BASE",
+            "CELLS",
+            "RESTORE",
+            "SEEN",
+            "WALLS",
+        )
         full |= {name: features[name] for name in names}
     # Without anything to move there is nothing to hold.
     full["MOTION"] = features["MOTION"]

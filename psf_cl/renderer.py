@@ -365,7 +365,15 @@ class Renderer:
             counters[layout.COUNTER_INDEX[name]] = first
         self.device.write(self.buffers["counters"], counters)
         names = (name for ring, sums, _ in film.PLANES for name in (ring, sums))
-        for name in ("pool", "splats", "film_half", "film_lost", "surfaces_seen", *names):
+        for name in (
+            "pool",
+            "splats",
+            "film_cells",
+            "film_half",
+            "film_lost",
+            "surfaces_seen",
+            *names,
+        ):
             if name in self.buffers:
                 self.device.fill(self.buffers[name])
 
@@ -517,6 +525,8 @@ class Renderer:
         aovs["samples"] = scalar(main["count"])
         if names & {"motion", "history", "alpha", "gradient"}:
             aovs |= self._temporal_aovs(main["count"], bool(partial))
+        if names & set(cells.VIEWS):
+            aovs |= self._cell_aovs(main["count"])
         count = main["count"].astype(np.float64)
         variance = main["squares"] / np.maximum(count - 1, 1) / np.maximum(count, 1)
         aovs["variance"] = scalar(np.where(count > 1, variance, 0.0))
@@ -560,6 +570,19 @@ class Renderer:
         return {
             name: self._in_rows(values.reshape(self.plan.pixel_count, -1))
             for name, values in aovs.items()
+        }
+
+    def _cell_aovs(self, count: np.ndarray) -> dict[str, np.ndarray]:
+        """Return what pixels saw of cells: means over their ``count`` samples; 0 without cells."""
+        views = np.zeros(len(count), layout.CELL_VIEW.dtype)
+        if "film_cells" in self.buffers:
+            views = self.device.read(self.buffers["film_cells"])
+        divisor = np.maximum(count, 1).astype(np.float32)
+        return {
+            name: self._in_rows(
+                views[field] if name == "cells" else (views[field] / divisor)[:, None]
+            )
+            for name, field in cells.VIEWS.items()
         }
 
     def _restores(self) -> bool:

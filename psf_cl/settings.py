@@ -29,6 +29,11 @@ AOVS = {
     "motion": "pixels that what is seen has moved since the frame before: right, down",
     "history": "samples that the pixel is worth, with those of the frames before",
     "alpha": "weight of this frame in it",
+    "cells": "a colour for each cell that samples of the first pass looked up",
+    "occupancy": "part of the slots taken around the cells that samples looked up",
+    "cell_count": "samples in these cells",
+    "cell_variance": "of the luminance of these, with the surface's reflectance divided out",
+    "filter_weight": "part of the samples that used the average of a cell",
     "gradient": "change of the light since the frame before, 0 to 1, as probes found it",
 }
 

@@ -6,7 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene_builder import build, camera, floor, glowing, lambertian, render, renderer
+from scene_builder import (
+    LUMINANCE,
+    build,
+    camera,
+    floor,
+    glowing,
+    lambertian,
+    render,
+    renderer,
+)
 
 from psf_cl.device import layout
 from psf_cl.device.device import open_device
@@ -15,6 +24,7 @@ from psf_cl.plan import make_plan
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.model import Environment, Material
 from psf_cl.settings import Settings
+from psf_cl.stages.cells import VIEWS
 
 FILTER = {"path_filter": "hash_grid"}
 
@@ -145,8 +155,13 @@ def test_one_cell_for_all_shows_the_mean_of_a_lit_plane_times_its_texture(device
     np.testing.assert_allclose(shared.mean(axis=0), light.mean(axis=0), rtol=1e-4)
 
 
-def test_a_plane_equals_a_model_of_its_cells(device):
-    """No jitter, edges of one level: cells are squares that NumPy tells apart as well."""
+def plane_of_cells(device, outputs=()):
+    """Render a plane without jitter and with edges of one level: squares that NumPy tells apart.
+
+    Returns:
+        image; for the pixels that see the plane: a mask in the order of the queue, that order, the
+        numbers of their cells, their light behind the plane (n, 3) and what the plane lets through.
+    """
     lamp = transform.translation((0.3, 0.5, 0.2)) @ transform.rotation_xyz_degrees((180, 0, 0))
     scene = build(
         [
@@ -158,30 +173,76 @@ def test_a_plane_equals_a_model_of_its_cells(device):
         (48, 48),
     )
     settings = {**FILTER, "filter_vertex": "1", "cell_jitter": False, "cell_shrink": False}
-    opened = patched(renderer(device, scene, **settings), cell_width=0.25 / 199.99)
+    settings["cell_walls"] = False
+    opened = patched(renderer(device, scene, outputs, **settings), cell_width=0.25 / 199.99)
     opened.render(spp=1)
-    pixels = opened.image().rgb.reshape(-1, 3)[opened.order]
+    image, order = opened.image(), opened.order
     beyond, vertices = (
-        opened.device.read(opened.buffers[name])[: len(pixels)] for name in ("beyond", "vertices")
+        opened.device.read(opened.buffers[name])[: len(order)] for name in ("beyond", "vertices")
     )
     opened.close()
-    low = (beyond["vertex"] & layout.CONSTANT["VERTEX_MASK"] == 1) & (
-        np.abs(vertices["p"][:, 1]) < 1e-3
-    )
+    low = beyond["vertex"] & layout.CONSTANT["VERTEX_MASK"] == 1
+    low &= np.abs(vertices["p"][:, 1]) < 1e-3
     assert low.sum() > 1500
     gate = vertices["gate"][low].astype(np.float64)
     np.testing.assert_allclose(gate, np.broadcast_to((0.5, 0.6, 0.7), gate.shape), rtol=1e-6)
     places = vertices["p"][low].astype(np.float64) / 0.25 + (0.37, 0.61, 0.83)
-    _, cell = np.unique(np.floor(places), axis=0, return_inverse=True)
-    cell = cell.ravel()
+    near = beyond["vertex"][low, None] >> 31
+    cell = np.unique(np.hstack([np.floor(places), near]), axis=0, return_inverse=True)[1].ravel()
     assert cell.max() > 40
+    return image, low, order, cell, beyond["radiance"][low] / gate, gate
+
+
+def test_a_plane_equals_a_model_of_its_cells(device):
+    image, low, order, cell, light, gate = plane_of_cells(device)
     sums = np.zeros((cell.max() + 1, 3))
-    np.add.at(sums, cell, beyond["radiance"][low] / gate)
+    np.add.at(sums, cell, light)
     expected = (sums / np.bincount(cell)[:, None])[cell] * gate
     # Lengths differ by 1e-4: a few samples are in cells of the next level, or look there.
-    found = np.isclose(pixels[low], expected, rtol=1e-4, atol=1e-5).all(axis=1)
+    pixels = image.rgb.reshape(-1, 3)[order][low]
+    found = np.isclose(pixels, expected, rtol=1e-4, atol=1e-5).all(axis=1)
     assert found.mean() > 0.97
     assert expected.std() > 0.3 * expected.mean()
+
+
+def test_images_of_cells_equal_a_model_of_them(device):
+    image, low, order, cell, light, _ = plane_of_cells(device, VIEWS)
+
+    def seen(name):
+        return image.aovs[name].reshape(len(order), -1)[order][low]
+
+    count = np.bincount(cell)
+    luminance = light @ LUMINANCE
+    mean = np.bincount(cell, luminance) / count
+    variance = np.bincount(cell, luminance**2) / count - mean**2
+    assert (seen("filter_weight") == 1).all()
+    assert (seen("cell_count")[:, 0] == count[cell]).mean() > 0.97
+    close = np.isclose(seen("cell_variance")[:, 0], variance[cell], rtol=1e-3, atol=1e-5)
+    assert close.mean() > 0.97 and variance.max() > 1e-3
+    # Colours tell cells apart, and nothing else does.
+    colors = np.unique(np.hstack([seen("cells"), cell[:, None]]), axis=0)
+    assert cell.max() < len(colors) < 1.2 * cell.max()
+    assert len(np.unique(colors[:, :3], axis=0)) > 0.95 * len(colors)
+    occupancy = seen("occupancy")
+    assert ((occupancy >= 1 / 64) & (occupancy <= 1)).all()
+    np.testing.assert_array_equal(occupancy * 64, np.round(occupancy * 64))
+
+
+def test_images_of_cells_are_empty_without_cells(device):
+    image = render(device, room(), 2, VIEWS)
+    for name in VIEWS:
+        assert not image.aovs[name].any(), name
+    opened = renderer(device, room(), VIEWS, **FILTER, filter_vertex="1", cell_size=0.001)
+    image = image_of(patched(opened, cell_slots=1), 2)
+    assert not any(image.aovs[name].any() for name in ("cells", "cell_count", "filter_weight"))
+
+
+def test_images_of_cells_change_no_bit_of_the_picture(device):
+    plain = render(device, room(), 3, **FILTER, filter_vertex="1")
+    viewed = render(device, room(), 3, VIEWS, **FILTER, filter_vertex="1")
+    np.testing.assert_array_equal(viewed.rgb, plain.rgb)
+    weight = viewed.aovs["filter_weight"]
+    assert weight.max() == 1 and (weight <= 1).all()
 
 
 @pytest.mark.parametrize("slots", [1, 64])

@@ -479,6 +479,7 @@ def test_plan_follows_the_options(all_features, capsys):
 
     plan, off = features("")
     unused = {
+        "AOV_CELLS",
         "BACK_FACES",
         "BASE",
         "CELLS",

@@ -81,6 +81,9 @@
 #ifndef CELLS
 #error "CELLS must be 0, 1 (all of a vertex's light is shared) or 2 (that of its diffuse base)"
 #endif
+#ifndef AOV_CELLS
+#error "AOV_CELLS must be 0 or 1"
+#endif
 #ifndef WALLS
 #error "WALLS must be 0 or 1 (walls inside cells keep light apart)"
 #endif

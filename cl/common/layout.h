@@ -619,6 +619,22 @@ typedef struct {
     uint pad; // fills the record
 } Cell;
 
+/// The second moment of a cell: a 64-bit fixed-point sum.
+typedef struct {
+    uint low; // of (luminance / cell_limit)^2; from resolve_cells on a float's bits: the variance
+    uint high; // of the same
+} CellSquares;
+
+/// What the samples of a pixel saw of cells: sums over its samples.
+typedef struct {
+    float color[3]; // of the cell of the first pass, made of its key; not a sum
+    float occupancy; // part of its bucket's slots that are taken
+    float count; // samples in it
+    float variance; // of their luminance
+    float weight; // 1 for a sample that used a cell's average
+    float pad; // fills the record
+} CellView;
+
 /// What the paths of a pass brought to a pixel: 64-bit fixed-point sums.
 typedef struct {
     uint low[3]; // of radiance

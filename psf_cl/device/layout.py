@@ -547,6 +547,28 @@ CELL = Record(
     """),
 )
 
+CELL_SQUARES = Record(
+    "CellSquares",
+    "The second moment of a cell: a 64-bit fixed-point sum.",
+    _fields("""
+    uint low - of (luminance / cell_limit)^2; from resolve_cells on a float's bits: the variance
+    uint high - of the same
+    """),
+)
+
+CELL_VIEW = Record(
+    "CellView",
+    "What the samples of a pixel saw of cells: sums over its samples.",
+    _fields("""
+    float color[3] - of the cell of the first pass, made of its key; not a sum
+    float occupancy - part of its bucket's slots that are taken
+    float count - samples in it
+    float variance - of their luminance
+    float weight - 1 for a sample that used a cell's average
+    float pad - fills the record
+    """),
+)
+
 SPLAT_SUM = Record(
     "SplatSum",
     "What the paths of a pass brought to a pixel: 64-bit fixed-point sums.",
@@ -613,6 +635,8 @@ RECORDS = (
     BEYOND,
     LOST,
     CELL,
+    CELL_SQUARES,
+    CELL_VIEW,
     SPLAT_SUM,
     GUIDE_SUM,
     GUIDE_CELL,

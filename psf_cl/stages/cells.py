@@ -21,6 +21,15 @@ HEADROOM = 1024.0
 #: Knaus, Zwicker: Progressive Photon Mapping: A Probabilistic Approach, 2011 (alpha = 2/3).
 SHRINK_EXPONENT = -1.0 / 6.0
 
+#: Images of cells, and where ``layout.CELL_VIEW`` has them.
+VIEWS = {
+    "cells": "color",
+    "occupancy": "occupancy",
+    "cell_count": "count",
+    "cell_variance": "variance",
+    "filter_weight": "weight",
+}
+
 #: Features that the rays that look for walls depend on.
 TRACING = ("WALLS", "FEW", "INSTANCES", "ALPHA", "VERTEX_COLORS")
 
@@ -125,6 +134,12 @@ def plan(context: Context) -> StageSpec | None:
             passing=True,
         ),
     )
+    if context.on("AOV_CELLS"):
+        squares, view = layout.CELL_SQUARES.dtype, layout.CELL_VIEW.dtype
+        buffers += (
+            BufferSpec("cell_squares", squares, context.ring * slots, "second moments", True),
+            BufferSpec("film_cells", view, context.pixel_count, "what pixels saw of cells"),
+        )
     if walls:
         what = "cells with light from near"
         buffers += (BufferSpec("near_cells", uint32, context.ring * slots, what, True),)
@@ -154,7 +169,7 @@ def plan(context: Context) -> StageSpec | None:
         "cells",
         "light is shared by the paths that meet in a cell",
         "cells.cl",
-        flags=("BASE", "CELLS", "RESTORE", *TRACING),
+        flags=("AOV_CELLS", "BASE", "CELLS", "RESTORE", *TRACING),
         kernels=kernels,
         buffers=buffers,
         traces=True,
