@@ -1,12 +1,14 @@
-"""Run presets in Oclgrind: ``python tools/check_kernels.py [--presets a,b] [--lanes 1,16]``.
+"""Run every kernel in Oclgrind: ``python tools/check_kernels.py [--jobs a,b] [--lanes 1,16]``.
 
 Oclgrind is a simulator of OpenCL devices (Debian's package ``oclgrind``): it reports every access
 outside of a buffer, data races between work items, and barriers that not all of a group reach.  It
-is also a second implementation, in which habits of PoCL show.  Small pictures of small scenes, with
-a list of triangles and with a tree that is built, for each preset and width of lanes.
+is also a second implementation, in which habits of PoCL show.  A job is a small picture of a small
+scene, for each preset with a list of triangles and with a tree that is built, and some more for
+what no preset uses: sequences, instances, trees of lights, all outputs.
 
 Optimisations are off, for it knows no vector intrinsics, and so are builtins of compilers.  The
-exit code is 1 if it reports anything, and if it could not run at all.
+exit code is 1 if it reports anything, if it could not run at all, and, where all jobs were asked
+for, if there is a kernel that none of them launched.
 
 Source: Price, McIntosh-Smith: Oclgrind: An Extensible OpenCL Device Simulator, IWOCL 2015.
 """
@@ -17,24 +19,30 @@ import argparse
 import contextlib
 import dataclasses
 import os
+import re
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stability_cases import camera, grey, matt, room, scene_of
+from stability_cases import camera, grey, matt, room, room_that_moves, scene_of
 
+import psf_cl.instancing
 import psf_cl.renderer
+import psf_cl.stages
 from psf_cl.device.device import open_device
+from psf_cl.device.program import Launch
+from psf_cl.device.sources import kernel_folder
 from psf_cl.renderer import Renderer
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.model import Environment, Light, Material, Mesh, Scene, Texture
-from psf_cl.settings import PRESETS, Settings, resolve
+from psf_cl.settings import PRESETS, resolve
 from psf_cl.traits import DeviceTraits
 
 LIBRARIES = (
@@ -98,7 +106,63 @@ def _veil() -> Material:
     return Material(alpha=0.5, alpha_mode="blend", metallic=1.0, base_color_texture=0)
 
 
-SCENES = {"room": room, "everything": everything}
+def instances(edge: int) -> Scene:
+    """Return the room with four balls, which have one tree together."""
+    scene = room(edge)
+    ball = scene.shapes[1]
+    places = ((0.0, 0.0, 0.0), (-0.6, 0.0, 0.0), (0.0, 0.9, -0.5), (-0.6, 0.8, -0.5))
+    balls = [
+        dataclasses.replace(ball, transform=transform.translation(place) @ ball.transform)
+        for place in places
+    ]
+    return dataclasses.replace(scene, shapes=(scene.shapes[0], scene.shapes[2], *balls))
+
+
+@dataclass(frozen=True)
+class Job:
+    """One picture, or the pictures of a sequence.
+
+    Attributes:
+        tree: whether triangles are in a tree; else they are a list.
+        times: of the frames after the first, s.
+        everything: with all outputs and statistics, and a look at the first pass before its end.
+    """
+
+    scene: Callable[[int], Scene]
+    preset: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    tree: bool = True
+    times: tuple[float, ...] = ()
+    everything: bool = False
+
+
+JOBS = {
+    **{f"{preset}, tree": Job(room, preset) for preset in PRESETS},
+    **{f"{preset}, list": Job(everything, preset, tree=False) for preset in PRESETS},
+    "sequence, tree": Job(room_that_moves, "game", times=(0.1, 1.0)),
+    "sequence, list": Job(room_that_moves, "game", tree=False, times=(1.0,)),
+    "exponential": Job(room_that_moves, "pt", {"temporal": "exponential"}, False, (1.0,)),
+    "instances": Job(instances, "psf"),
+    "hierarchy": Job(everything, "pt", {"light_sampling": "hierarchy"}, tree=False),
+    "photons over power": Job(room, "photon", {"photon_over": "power"}),
+    "range search": Job(
+        room, "psf", {"path_filter": "range_search", "filter_restore": False}, everything=True
+    ),
+    "outputs": Job(everything, "psf", tree=False, everything=True),
+    "splits": Job(room, "pt", {"splits": 2, "sampler": "random", "direct_sampling": "bsdf"}),
+}
+
+OUTPUTS = ("albedo", "normal", "depth", "direct", "indirect", "variance", "samples", "motion")
+
+#: Tables that are large whatever the scene, made small: simulators are slow.
+SMALL_TABLES = (
+    (psf_cl.stages.guide, "LEAST_SLOTS", 64),
+    (psf_cl.stages.photons, "CELLS", 64),
+    (psf_cl.stages.metropolis, "CANDIDATES", 256),
+    (psf_cl.stages.metropolis, "MUTATIONS_PER_EPOCH", 4),
+    (psf_cl.stages.range_search, "BATCH", 64),
+    (psf_cl.instancing, "LEAST_SAVED", 1),
+)
 
 
 class InTurn(Executor):
@@ -113,25 +177,66 @@ class InTurn(Executor):
         return future
 
 
-def render(name: str, preset: str, lanes: int, tree: bool) -> None:
-    """Render one picture on the simulator; its reports go where its environment says."""
+def render(job: Job, lanes: int) -> set[str]:
+    """Render a job on the simulator; its reports go where its environment says.
+
+    Returns:
+        the names of the kernels that were launched.
+    """
     # The simulator runs one kernel at a time, whatever threads ask for it.
     psf_cl.renderer.ThreadPoolExecutor = InTurn  # type: ignore[misc,assignment]
-    few = 0 if tree else 400
+    for module, name, value in SMALL_TABLES:
+        setattr(module, name, value)
+    launched: set[str] = set()
+    launch = Launch.__call__
+
+    def noting(self: Launch, items: int, group: int | None = None) -> None:
+        launched.add(self.name)
+        launch(self, items, group)
+
+    Launch.__call__ = noting  # type: ignore[method-assign]
+    few = 0 if job.tree else 400
     traits = DeviceTraits(
         "cpu", lanes, 16, slots=64, group=4, run=2, few_triangles=few, few_corners=few
     )
     device = open_device("oclgrind", traits)
-    small = {key: value for key, value in SMALL.items() if hasattr(Settings(), key)}
-    settings = resolve({}, name, preset, small)
-    with contextlib.closing(Renderer(SCENES[name](EDGE), settings, device)) as renderer:
+    settings = resolve({}, "a job", job.preset, SMALL | dict(job.settings))
+    scene = job.scene(EDGE)
+    renderer = Renderer(
+        scene,
+        settings,
+        device,
+        OUTPUTS if job.everything else (),
+        statistics=job.everything,
+        halves=job.everything,
+    )
+    with contextlib.closing(renderer):
+        if job.everything:
+            renderer.step()
+            renderer.image()
         renderer.render(spp=2)
+        for time in job.times:
+            renderer.image()
+            renderer.set_frame(time)
+            renderer.render(spp=1)
         if not np.isfinite(renderer.image().rgb).all():
             raise SystemExit("a pixel is not finite")
+    return launched
 
 
-def job(library: str, name: str, preset: str, lanes: int, tree: bool) -> tuple[str, float]:
-    """Run ``render`` in a process that sees only the simulator; return its reports and seconds."""
+def all_kernels() -> set[str]:
+    """Return the names of all kernels that there are."""
+    pattern = re.compile(r"^(?:__)?kernel\s(?:[^({]|\([^)]*\)\))*?void\s+(\w+)\(", re.MULTILINE)
+    texts = (path.read_text(encoding="utf-8") for path in kernel_folder().glob("*.cl"))
+    return {name for text in texts for name in pattern.findall(text)}
+
+
+def run(library: str, name: str, lanes: int) -> tuple[str, set[str], float]:
+    """Run ``render`` in a process that sees only the simulator.
+
+    Returns:
+        its reports, the kernels that it launched, and its seconds.
+    """
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "log"
         (Path(folder) / "oclgrind.icd").write_text(library + "\n")
@@ -143,7 +248,7 @@ def job(library: str, name: str, preset: str, lanes: int, tree: bool) -> tuple[s
             "OCLGRIND_MAX_ERRORS": "20",
         }
         start = time.perf_counter()
-        command = [sys.executable, __file__, "--job", name, preset, str(lanes), str(int(tree))]
+        command = [sys.executable, __file__, "--job", name, str(lanes)]
         try:
             done = subprocess.run(
                 command,
@@ -154,43 +259,46 @@ def job(library: str, name: str, preset: str, lanes: int, tree: bool) -> tuple[s
                 timeout=JOB_SECONDS,
             )
         except subprocess.TimeoutExpired:
-            return f"not done after {JOB_SECONDS:.0f} s", JOB_SECONDS
+            return f"not done after {JOB_SECONDS:.0f} s", set(), JOB_SECONDS
         reports = log.read_text(errors="replace").strip() if log.exists() else ""
         if done.returncode != 0:
             reports += "\n" + "\n".join(done.stderr.strip().splitlines()[-6:])
-        return reports.strip(), time.perf_counter() - start
+        launched = set(done.stdout.splitlines()[-1].split()) if done.stdout else set()
+        return reports.strip(), launched, time.perf_counter() - start
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the jobs that were asked for; return 0 if nothing was reported, else 1."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--presets", default=",".join(PRESETS), help="default: all")
+    parser.add_argument("--jobs", metavar="A,B", default="", help="parts of names; default: all")
     parser.add_argument("--lanes", default="1,16")
-    parser.add_argument("--scenes", default=",".join(SCENES))
     parser.add_argument("--library", help="liboclgrind-rt-icd.so, if it is at no usual place")
-    parser.add_argument("--job", nargs=4, help=argparse.SUPPRESS)
+    parser.add_argument("--job", nargs=2, help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
     if args.job:
-        name, preset, lanes, tree = args.job
-        render(name, preset, int(lanes), tree == "1")
+        name, lanes = args.job
+        print(*sorted(render(JOBS[name], int(lanes))))
         return 0
     library = args.library or next((path for path in LIBRARIES if Path(path).exists()), None)
     if library is None:
         print("Oclgrind is not there; install it: sudo apt-get install oclgrind", file=sys.stderr)
         return 1
-    failed = 0
-    for preset in args.presets.split(","):
+    failed, launched = 0, set()
+    names = [name for name in JOBS if any(part in name for part in args.jobs.split(","))]
+    for name in names:
         for lanes in map(int, args.lanes.split(",")):
-            for name in args.scenes.split(","):
-                # The room has a tree that is built, the other scene a list.
-                reports, seconds = job(library, name, preset, lanes, tree=name == "room")
-                verdict = "FAILED" if reports else "nothing reported"
-                print(f"{preset}, {lanes} lanes, {name}: {verdict} ({seconds:.0f} s)", flush=True)
-                if reports:
-                    failed += 1
-                    print(reports)
-    print(f"{failed} jobs with reports")
-    return int(failed > 0)
+            reports, kernels, seconds = run(library, name, lanes)
+            launched |= kernels
+            verdict = "FAILED" if reports else "nothing reported"
+            print(f"{name}, {lanes} lanes: {verdict} ({seconds:.0f} s)", flush=True)
+            if reports:
+                failed += 1
+                print(reports)
+    missing = sorted(all_kernels() - launched) if len(names) == len(JOBS) else []
+    if missing:
+        print(f"never launched: {', '.join(missing)}")
+    print(f"{failed} jobs with reports, {len(launched)} kernels")
+    return int(failed > 0 or bool(missing) or not names)
 
 
 if __name__ == "__main__":
