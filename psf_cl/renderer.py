@@ -39,7 +39,7 @@ from psf_cl.scene.digest import scene_digest
 from psf_cl.scene.far import far_from_origin, moved
 from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Scene
-from psf_cl.scheduler import MAX_PASSES, Hooks, Progress, Scheduler, doubling_epoch
+from psf_cl.scheduler import MAX_PASSES, Hooks, Progress, Scheduler, doubling_epoch, longest_epoch
 from psf_cl.settings import Settings, resolve
 from psf_cl.stages import (
     cells,
@@ -252,7 +252,8 @@ class Renderer:
         """Return the pass of a frame before which the epoch ends that starts with ``passes``."""
         if not self.running.in_epochs:
             return MAX_PASSES
-        return doubling_epoch(passes, self.plan.shortest_epoch)
+        longest = longest_epoch(self.plan.pixel_count)
+        return doubling_epoch(passes, self.plan.shortest_epoch, longest)
 
     def _epoch(self, start: int) -> range:
         """Return the epoch that starts with pass ``start``, counted over all frames."""

@@ -25,17 +25,28 @@ MAX_PASSES = 1 << 31
 #: Bounces between two looks of the film at the ring of samples.
 BOUNCES_PER_FILM = 4
 
-#: Passes of the longest epoch: what is learned or emitted between epochs is that old at most.
+#: Passes of the longest epoch, but of small pictures: what is learned or emitted between epochs is
+#: that old at most.
 MAX_EPOCH = 64
 
 
-def doubling_epoch(start: int, shortest: int = 1) -> int:
+#: Samples below which the longest epoch of a small picture does not stay: between epochs the pool
+#: drains, and photons are emitted for all that follows.
+MAX_EPOCH_SAMPLES = 1 << 18
+
+
+def longest_epoch(pixel_count: int) -> int:
+    """Return the passes of the longest epoch of a picture."""
+    return max(MAX_EPOCH, MAX_EPOCH_SAMPLES // pixel_count)
+
+
+def doubling_epoch(start: int, shortest: int = 1, longest: int = MAX_EPOCH) -> int:
     """Return the pass before which the epoch ends that starts with pass ``start``.
 
-    Epochs are 1, 1, 2, 4 .. MAX_EPOCH passes long, or so many times ``shortest`` up to at least
+    Epochs are 1, 1, 2, 4 .. ``longest`` passes long, or so many times ``shortest`` up to at least
     that: draining the pool soon costs next to nothing.
     """
-    return start + max(min(max(start, 1), MAX_EPOCH), shortest)
+    return start + max(min(max(start, 1), longest), shortest)
 
 
 @dataclass(frozen=True)

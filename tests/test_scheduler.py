@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from psf_cl.device.layout import COUNTER_INDEX
-from psf_cl.scheduler import MAX_EPOCH, Hooks, Progress, Scheduler, doubling_epoch
+from psf_cl.scheduler import MAX_EPOCH, Hooks, Progress, Scheduler, doubling_epoch, longest_epoch
 
 
 class CountingPool:
@@ -73,6 +73,17 @@ def test_epochs_grow_to_a_limit() -> None:
     lengths = [after - before for before, after in pairwise(starts)]
     assert lengths[:8] == [1, 1, 2, 4, 8, 16, 32, 64]
     assert max(lengths) == lengths[-1] == MAX_EPOCH
+
+
+def test_epochs_of_one_pixel_hold_as_many_samples_as_those_of_small_pictures() -> None:
+    """Epochs of 64 samples took a thousand times as long as their paths did."""
+    assert longest_epoch(64 * 64) == longest_epoch(8192 * 64) == MAX_EPOCH
+    for pixels in (1, 10, 1000):
+        assert (1 << 18) - pixels < pixels * longest_epoch(pixels) <= 1 << 18
+    starts = [0]
+    while starts[-1] < 10**6:
+        starts.append(doubling_epoch(starts[-1], longest=longest_epoch(1)))
+    assert len(starts) < 25
 
 
 def test_nothing_happens_between_passes_without_epochs() -> None:

@@ -187,11 +187,9 @@ def test_the_table_tells_good_from_bad(tool, device, monkeypatch, tmp_path, caps
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("lanes", [1, 16])
-@pytest.mark.parametrize("preset", PRESETS)
-def test_a_simulator_finds_no_fault_in_any_kernel(preset, lanes):
-    """Out of bounds, races, divergent barriers."""
-    command = [sys.executable, "tools/check_kernels.py", "--presets", preset, "--lanes", str(lanes)]
+def test_a_simulator_finds_no_fault_in_any_kernel():
+    """Out of bounds, races, divergent barriers; and no kernel is left out."""
+    command = [sys.executable, "tools/check_kernels.py"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     if "Oclgrind is not there" in done.stderr:
         pytest.skip("Oclgrind is not installed")

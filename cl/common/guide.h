@@ -164,7 +164,7 @@ static inline Guide find_guide(
             lane_slot[k] = inserts ? find_or_insert(keys, lane_bucket[k], size, lane_key[k])
                                    : find((const __global uint *)keys, lane_bucket[k], size, lane_key[k]);
             if (inserts && lane_slot[k] == NO_SLOT) {
-                full[lane_bucket[k] / size] = 1u;
+                MARK(&full[lane_bucket[k] / size]);
                 ++failed;
             }
         }

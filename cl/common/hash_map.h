@@ -37,9 +37,20 @@ static inline UInt bucket_of(UInt hash, uint slots) { return hash & (slots - 1u)
 // A look at a word that others may be claiming: it is 0 or the key that is there for good.  In OpenCL C 1.2
 // that is a race in letter; an atomic for every look would cost more than it is worth.
 #ifdef PLAIN_C
-#define LOOK(word) atomic_or(word, 0u)
+#define LOOK(word) atomic_or((volatile __global uint *)(word), 0u)
+#define MARK(word) atomic_or((volatile __global uint *)(word), 1u)
+static inline UInt look_lanes(const __global uint *words, UInt at)
+{
+    uint lane[W];
+    store_lanes_u(at, lane);
+    for (uint k = 0; k < W; ++k)
+        lane[k] = LOOK(&words[lane[k]]);
+    return load_lanes_u(lane);
+}
 #else
 #define LOOK(word) (*(word))
+#define MARK(word) (*(word) = 1u)
+static inline UInt look_lanes(const __global uint *words, UInt at) { return GATHER_WORD(words, at); }
 #endif
 
 /// Slot of the key in its bucket, claimed if it was not there; NO_SLOT if the bucket is full.
@@ -61,7 +72,7 @@ static inline uint find(const __global uint *keys, uint bucket, uint size, uint 
 {
     for (uint i = 0; i < size; ++i) {
         const uint slot = bucket + ((key + i) & (size - 1u));
-        const uint found = keys[slot];
+        const uint found = LOOK(&keys[slot]);
         if (found == key)
             return slot;
         if (found == 0u)
@@ -77,9 +88,9 @@ static inline UInt find_lanes(
     const __global uint *keys, const __global uint *full_buckets, Mask mask, UInt bucket, uint size, UInt key)
 {
     const uint shift = popcount(size - 1u);
-    const Mask usable = mask & (GATHER_WORD(full_buckets, bucket >> shift) == 0u);
+    const Mask usable = mask & (look_lanes(full_buckets, bucket >> shift) == 0u);
     const UInt start = bucket + (key & (size - 1u));
-    const UInt first = GATHER_WORD(keys, start);
+    const UInt first = look_lanes(keys, start);
     const Mask there = usable & (first == key);
     UInt slot = pick_u(there, start, (UInt)(NO_SLOT));
     const Mask further = usable & !there & (first != 0u);
