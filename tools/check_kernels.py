@@ -53,7 +53,7 @@ LIBRARIES = (
 EDGE = 4
 
 #: Settings that make presets light enough for a simulator.
-SMALL = {"max_depth": 2, "chains": 128}
+SMALL = {"max_depth": 2, "chains": 128, "photons": 64}
 JOB_SECONDS = 1200.0
 
 
