@@ -119,24 +119,23 @@ static inline void store_samples(
     store_lanes_u(square_low, lane_square_low);
     store_lanes_u(square_high, lane_square_high);
 #endif
-    uint lane_bucket[W];
-    uint lane_key[W];
-    store_lanes_u(key.bucket, lane_bucket);
-    store_lanes_u(key.key, lane_key);
     const uint size = bucket_size(params->cell_slots);
+    uint lane_bucket[W];
+    uint lane_slot[W];
+    uint lane_same[W];
+    store_lanes_u(key.bucket, lane_bucket);
+    uint left = claim_lanes(keys, cells, lane_bits(there), key.bucket, key.key, size, lane_slot, lane_same);
     uint failed = 0;
-    for (uint left = lane_bits(there); left;) {
+    for (; left; left &= left - 1u) {
         const uint i = lowest_bit(left);
-        const uint same = left & lane_bits((key.bucket == lane_bucket[i]) & (key.key == lane_key[i]));
-        left &= ~same;
-        const uint slot = find_or_insert(keys, lane_bucket[i], size, lane_key[i]);
+        const uint slot = lane_slot[i];
         if (slot == NO_SLOT) {
             full_buckets[lane_bucket[i] / size] = 1u;
-            failed += popcount(same);
+            failed += popcount(lane_same[i]);
         } else {
-            add_lanes(&cells[slot], same, lane_low, lane_high);
+            add_lanes(&cells[slot], lane_same[i], lane_low, lane_high);
 #if AOV_CELLS
-            const ulong square = sum_lanes(same, lane_square_low, lane_square_high);
+            const ulong square = sum_lanes(lane_same[i], lane_square_low, lane_square_high);
             add_fixed(&squares[slot].low, &squares[slot].high, (uint)square, (uint)(square >> 32));
 #endif
         }
