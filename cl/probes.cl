@@ -241,6 +241,12 @@ kernel void place_probes(SCENE_PARAMETERS CHOICE_PARAMETERS, __global Probe *pro
 // Tiles around a tile, in each direction, whose probes decide with its own.
 #define POOLED 3
 
+// A change counts by what it is larger than the standard error of the sums, squared, so many times.
+#define DOUBT 2.0f
+
+// A change of all light of which so much is left beyond doubt is one.
+#define CLEAR 0.5f
+
 // A relative difference that may be rounding.
 #define DEAD_BAND 0.02f
 
@@ -251,7 +257,26 @@ static inline float part_of(float difference, float larger)
     return clamp((part - DEAD_BAND) / (1.0f - DEAD_BAND), 0.0f, 1.0f);
 }
 
+/// Sums over the probes of a square of tiles.
+typedef struct {
+    float difference; // with its sign: what some paths gain and others lose has not changed
+    float square;     // of the same
+    float larger;     // of what was and what is
+} Pool;
+
+/// How much of the light of a pool has changed, beyond what the paths that were chosen may make of it; 1 where
+/// hardly a doubt is left that all of it came or went.
+static inline float change_of(Pool pool)
+{
+    const float square = pool.difference * pool.difference - DOUBT * pool.square;
+    const float change = part_of(sqrt(max(square, 0.0f)), pool.larger);
+    return fabs(pool.difference) == pool.larger && change > CLEAR ? 1.0f : change;
+}
+
 /// Find how much light has changed around each probe: 0 not at all, 1 altogether.  One work item a probe.
+///
+/// The largest square of tiles has the least doubt, but shadows that move take away on one side of it what
+/// they give on the other: the largest change of those around a tile counts.
 ///
 /// reads   probes
 /// writes  changes
@@ -264,16 +289,29 @@ kernel void pool_probes(__global const Params *params, __global const Probe *pro
         return;
     const int row = at / columns;
     const int column = at - row * columns;
-    float2 difference = (float2)(0.0f);
-    float2 larger = (float2)(0.0f);
+    Pool rings[POOLED + 1];
+    for (uint ring = 0; ring <= POOLED; ++ring)
+        rings[ring] = (Pool){0.0f, 0.0f, 0.0f};
+    float2 shining = (float2)(0.0f);
     for (int y = max(row - POOLED, 0); y <= min(row + POOLED, rows - 1); ++y)
         for (int x = max(column - POOLED, 0); x <= min(column + POOLED, columns - 1); ++x) {
             const float4 value = vload4(0, probes[y * columns + x].reflected);
+            const uint ring = max(abs(x - column), abs(y - row));
+            const float difference = value.y - value.x;
+            rings[ring].difference += difference;
+            rings[ring].square += difference * difference;
+            rings[ring].larger += max(value.x, value.y);
             // Lights that are seen outshine what they light: they only speak for themselves.
-            const float near = max(abs(x - column), abs(y - row)) <= 1u ? 1.0f : 0.0f;
-            const float2 weight = (float2)(1.0f, near);
-            difference += weight * fabs(value.yw - value.xz);
-            larger += weight * max(value.xz, value.yw);
+            if (ring <= 1u)
+                shining += (float2)(fabs(value.w - value.z), max(value.z, value.w));
         }
-    changes[at] = max(part_of(difference.x, larger.x), part_of(difference.y, larger.y));
+    float change = part_of(shining.x, shining.y);
+    Pool pool = rings[0];
+    for (uint ring = 1; ring <= POOLED; ++ring) {
+        pool.difference += rings[ring].difference;
+        pool.square += rings[ring].square;
+        pool.larger += rings[ring].larger;
+        change = max(change, change_of(pool));
+    }
+    changes[at] = change;
 }

@@ -49,11 +49,8 @@ typedef struct {
     Float square;
 } Known;
 
-// A change from which on nothing is kept.
+// A change from which on the frame has more than its part.
 #define CERTAIN 0.5f
-
-// A bias counts as one so many times as large: pixels have it together, and it stays.
-#define BIAS_FACTOR 2.0f
 
 // Before frames have shown it, their standard deviation is taken for half of the light, as two frames would say.
 #define PRIOR_VARIANCE 0.25f
@@ -65,7 +62,7 @@ static inline Float worth_of(Known known, Float change, Float fresh)
 {
     const Float level = luminance(known.rgb);
     // A change of c of the brighter of both leaves at least 1 - c of it.
-    const Float bias = BIAS_FACTOR * change * level / (1.0f - min(change, CERTAIN));
+    const Float bias = change * level / (1.0f - min(change, CERTAIN));
     const Float frames = known.count / max(fresh, 1.0f);
     const Float spread = max(known.square - level * level, 0.0f);
     const Float variance =
@@ -214,10 +211,12 @@ kernel void blend_history(
         count = min(count, fresh / max(alpha, 1e-6f));
     }
     const Mask changed = is_known & (change > 0.0f);
-    const Float part = min(change * (1.0f / CERTAIN), 1.0f);
+    const Float part = max(change - CERTAIN, 0.0f) * (1.0f / (1.0f - CERTAIN));
     alpha = pick(changed, alpha + part * part * (1.0f - alpha), alpha);
-    // As many samples as would have this weight if nothing had changed.
-    count = pick(changed, fresh / max(alpha, 1e-6f), count);
+    // The bias of what is kept stays, while noise goes: in the frames to come it counts for less, by the part
+    // of it that was worth keeping.
+    const Float left = fresh / max(alpha, 1e-6f) - fresh;
+    count = pick(changed, fresh + left * left / max(known.count, 1.0f), count);
     alpha = pick(is_known, alpha, (Float)(1.0f));
     const Vec3 mean = add_scaled(scale(known.rgb, 1.0f - alpha), rgb, alpha);
     const Float brightness = luminance(rgb);

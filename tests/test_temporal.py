@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from scene_builder import build, camera, floor, glowing, lambertian, render, ren
 
 from psf_cl.device.device import open_device
 from psf_cl.plan import make_plan
+from psf_cl.renderer import Renderer
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.curve import Curve
 from psf_cl.scene.load import load_scene
@@ -65,6 +67,10 @@ def sequence(device, scene, frames, spp=1, views=(), outputs=OUTPUTS, **settings
         images.append(opened.image())
     opened.close()
     return images
+
+
+def error_of(rgb, truth):
+    return float(np.mean((rgb - truth) ** 2 / (truth**2 + 0.01)))
 
 
 def test_frames_that_share_nothing_leave_nothing_behind():
@@ -235,14 +241,13 @@ def test_adaptive_is_ahead_of_both_other_rules_when_a_light_changes(device, fact
     scene, later = room(size, change=(at, factor)), room(size, factor=factor)
     before, after = render(device, room(size), 1024, seed=1).rgb, render(device, later, 1024).rgb
 
-    def error(image, truth):
-        return np.mean((image.rgb - truth) ** 2 / (truth**2 + 0.01))
-
-    images = sequence(device, later, frames - at, temporal="cumulative")
-    fresh = [error(image, after) for image in images]
+    # A start with the samples of the same frames.
+    images = [image.rgb for image in sequence(device, later, frames, outputs=())[at:]]
+    sums = np.cumsum(images, axis=0)
+    fresh = [error_of(mean / (k + 1), after) for k, mean in enumerate(sums)]
     errors = {
         rule: [
-            error(image, before if frame < at else after)
+            error_of(image.rgb, before if frame < at else after)
             for frame, image in enumerate(sequence(device, scene, frames, temporal=rule))
         ]
         for rule in ("adaptive", "cumulative", "exponential")
@@ -332,6 +337,54 @@ def test_history_goes_along_with_what_moves(device, tmp_path):
     np.testing.assert_allclose(images[3].aovs["motion"][..., 1], 0.0, atol=1e-3)
     history = np.broadcast_to(np.minimum(np.arange(32) // 2 + 1, 4), (24, 32))
     np.testing.assert_allclose(images[3].aovs["history"][..., 0], history, atol=1e-3)
+
+
+MOVING = Path(__file__).parents[1] / "scenes" / "moving"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "end", "frames"),
+    [
+        ("light_off", 8, 18),
+        ("light_moved", 8, 18),
+        ("camera_cut", 8, 18),
+        ("door_opens", 13, 24),
+        ("passing", 21, 29),
+    ],
+)
+def test_adaptive_leads_on_the_moving_scenes(device, name, end, frames):
+    """``end`` is the first frame that has nothing new; a cut forgets by itself, with any rule."""
+    scene = load_scene(MOVING / f"{name}.toml", moving=True, size=(80, 60))
+
+    def errors(rule, first=0, seed=0):
+        opened = Renderer(scene, Settings(temporal=rule, seed=seed), device, time=first / 24)
+        found = []
+        for frame in range(first, frames):
+            if frame > first:
+                opened.set_frame(frame / 24)
+            opened.render(spp=1)
+            found.append(error_of(opened.snapshot().rgb, truth[frame]))
+        opened.close()
+        return np.array(found)
+
+    opened = Renderer(scene, Settings(seed=777), device)
+    truth = []
+    for frame in range(frames):
+        opened.set_frame(frame / 24)
+        opened.render(spp=96)
+        truth.append(opened.snapshot().rgb)
+    opened.close()
+    rules = ("adaptive", "cumulative", "exponential")
+    found = {rule: np.mean([errors(rule, 0, s) for s in range(3)], axis=0) for rule in rules}
+    fresh = np.mean([errors("cumulative", end, seed) for seed in range(50, 53)], axis=0)
+    for since in (4, 8):
+        assert found["adaptive"][end + since - 1] < 1.1 * fresh[since - 1]
+    sums = {rule: one.sum() for rule, one in found.items()}
+    if name == "camera_cut":
+        assert sums["adaptive"] == sums["cumulative"] < sums["exponential"]
+    else:
+        assert sums["adaptive"] < min(sums["cumulative"], sums["exponential"])
 
 
 @pytest.mark.slow
