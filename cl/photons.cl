@@ -15,7 +15,6 @@
 #include "common/emission.h"
 #include "common/particle_map.h"
 
-#define NO_PLACE 0xffffffffu
 #define PLACE_FIELD PATH_RADIANCE_R // and the five behind it
 
 static inline void count_photons(volatile __global uint *photon_counters, uint which, Mask mask)
@@ -82,7 +81,7 @@ kernel void store_photons(
     __global const Params *params,
     __global float *photons,
     volatile __global uint *photon_counters,
-    __global const uint *light_groups,
+    __global const LightGroup *light_groups,
     __global const Surface *surfaces INSTANCE_PARAMETERS,
     volatile __global uint *particle_keys,
     volatile __global uint *particle_counts)
@@ -104,7 +103,7 @@ kernel void store_photons(
     const Vec3 wo = scale(get_v(path, PATH_DIRECTION_X), (Float)(-1.0f));
     const SurfacePoint s = surface_point(pick_u(hit, triangle, (UInt)(0u)), FIELD(path, PATH_HIT_U),
                                          FIELD(path, PATH_HIT_V), wo, surfaces INSTANCE_ARGUMENTS);
-    const UInt node = GATHER_WORD(light_groups, pick_u(hit, get_u(path, PATH_PIXEL), (UInt)(0u)));
+    const UInt node = GATHER_U(light_groups, pick_u(hit, get_u(path, PATH_PIXEL), (UInt)(0u)), node);
     const UInt key = mix_bits(get_u(path, PATH_SAMPLE) ^ params->seed);
     put_u(path, PATH_STATUS, pick_u(alive, (UInt)(STATUS_DONE), status));
     put_u(path, PATH_SHADOW_Z, key);
@@ -151,20 +150,18 @@ kernel void settle_photons(
     }
 }
 
-/// Make the table that paths ask of the places of the map.  One work item those of a cell.
+/// Make the table that paths ask of the places of the map.  One work item a row of them.
 ///
 /// reads   particle_words, particle_counts
-/// writes  particle_kinds, particle_sums, particle_runs
+/// writes  particle_table
 kernel void tabulate_photons(
     __global const Params *params,
     __global const uint *particle_words,
     __global const uint *particle_counts,
-    __global uint *particle_kinds,
-    __global uint *particle_sums,
-    __global uint *particle_runs)
+    __global uint *particle_table)
 {
-    const uint cell = get_global_id(0);
-    if (cell >= params->particle_cells)
+    const uint row = get_global_id(0);
+    if (row >= params->particle_cells)
         return;
-    tabulate_cell(params, particle_words, particle_counts, particle_kinds, particle_sums, particle_runs, cell);
+    tabulate_row(params, particle_words, particle_counts, particle_table, row);
 }

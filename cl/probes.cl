@@ -148,10 +148,9 @@ static inline LightChoice light_for_probe(
     query.p = above;
     query.n = s.ng;
 #if LIGHT_PHOTONS
-    for (uint size = 0; size < PARTICLE_SIZES; ++size)
-        query.cells[size] = particle_cell(params, s.p, s.ng, size);
+    query.row = find_row(params, particle_table, mask, s.p, s.ng);
 #endif
-    LightChoice choice = choose_light(params, lights CHOICE_ARGUMENTS, mask, &query, random);
+    LightChoice choice = choose_light(params, lights CHOICE_ARGUMENTS, mask, query, random);
     const UInt any = mul_hi(random, (UInt)(params->light_count));
     choice.light = pick_u(usual, choice.light, any);
     const Float chance = light_chance(params, lights CHOICE_ARGUMENTS, mask, choice.light, query);

@@ -141,7 +141,7 @@ static inline void store_features(
 ///
 /// reads   pool, scene tables
 /// writes  pool.{status, origin, direction, beta, radiance, direct, pdf, shadow, toward, light}; features;
-///         with LIGHT_SAMPLING pool.{light_normal, particle_place, particle_print};
+///         with LIGHT_SAMPLING pool.{light_normal, particle_row};
 ///         with CELLS pool.{vertex, length, beyond, share, light_share}, vertices; with GUIDE
 ///         pool.{guide, guide_from, guide_light, expected}, guide_keys, guide_full, guide_sums,
 ///         counters.{guide_failed, guide_rejected} (atomic)
@@ -211,13 +211,12 @@ kernel void shade_paths(
     LightQuery last;
     last.p = zero;
     last.n = zero;
-#if LIGHT_TREE
+#if LIGHT_SAMPLING
     last.p = get_v(path, PATH_ORIGIN_X);
     last.n = unpack_unit(get_u(path, PATH_LIGHT_NORMAL));
 #endif
 #if LIGHT_PHOTONS
-    last.cells[0].place = get_u(path, PATH_PARTICLE_PLACE);
-    last.cells[0].print = get_u(path, PATH_PARTICLE_PRINT);
+    last.row = get_u(path, PATH_PARTICLE_ROW);
 #endif
 #endif
 
@@ -435,7 +434,7 @@ kernel void shade_paths(
         LightQuery query;
         query.p = above;
         query.n = s.ng;
-#if LIGHT_TREE
+#if LIGHT_SAMPLING
         // As the next vertex will know it.
         const UInt normal = pack_unit(s.ng);
         put_u(path, PATH_LIGHT_NORMAL, normal);
@@ -446,14 +445,10 @@ kernel void shade_paths(
         UInt random_y;
         sample_bits(seed, index, PAIR_PARTICLES + depth, params->sampler, &random_x, &random_y);
         const Vec3 near = jittered(params, s.p, s.ng, random_x, random_y);
-        for (uint size = 0; size < PARTICLE_SIZES; ++size)
-            query.cells[size] = particle_cell(params, near, s.ng, size);
+        query.row = find_row(params, particle_table, asks, near, s.ng);
+        put_u(path, PATH_PARTICLE_ROW, query.row);
 #endif
-        const LightChoice choice = choose_light(params, lights CHOICE_ARGUMENTS, asks, &query, light_bits);
-#if LIGHT_PHOTONS
-        put_u(path, PATH_PARTICLE_PLACE, query.cells[0].place);
-        put_u(path, PATH_PARTICLE_PRINT, query.cells[0].print);
-#endif
+        const LightChoice choice = choose_light(params, lights CHOICE_ARGUMENTS, asks, query, light_bits);
         const LightSample light = sample_light(params, lights, surfaces,
                                                materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS,
 #if ENVIRONMENT == 2

@@ -715,8 +715,7 @@ def _light_sampling(settings: Settings, connected: bool, lights: int) -> Feature
         return Feature(0, "there is one light: nothing to choose")
     if settings.light_sampling == "hierarchy":
         return Feature(1, f"light_sampling is hierarchy: a tree of {lights} lights")
-    over = 3 if settings.photon_over == "hierarchy" else 2
-    return Feature(over, f"light_sampling is photon: photons of {lights} lights say which are seen")
+    return Feature(2, f"light_sampling is photon: photons of {lights} lights say which are seen")
 
 
 def _light_count(scene: Scene) -> int:
@@ -786,7 +785,12 @@ def _scene_buffers(context: Context, scene: Scene) -> tuple[BufferSpec, ...]:
             BufferSpec("light_bounds", layout.LIGHT_BOUNDS.dtype, lights, "to fit the tree"),
             BufferSpec("light_order", uint32, lights, "levels of the tree"),
             BufferSpec("light_places", uint32, 2 * lights, "where each light is in the tree"),
-            BufferSpec("light_groups", uint32, lights, "small subtrees, which photons tell apart"),
+            BufferSpec(
+                "light_groups",
+                layout.LIGHT_GROUP.dtype,
+                lights,
+                "small subtrees, which photons tell apart",
+            ),
         ]
     if context.features["ENVIRONMENT"].value == 2:
         buffers.append(

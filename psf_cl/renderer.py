@@ -357,7 +357,7 @@ class Renderer:
         self.device.write(self.buffers["materials"], tables.material_table(self.scene.materials))
         if self.light_tree is not None:
             self.light_tree.launch.set(near_share=tables.near_share(self.lights))
-            self.light_tree.fit()
+            self.light_tree.fit(self.lights)
 
     def _empty(self, first: int) -> None:
         """Leave no path in the pool and no sample in the film; ``first`` is the next pass."""

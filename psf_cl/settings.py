@@ -74,15 +74,17 @@ class Settings:
         "each might bring to a surface; photon: photons tell which of them see it",
     )
     photons: int = _number(
-        0, 0, 1 << 28, doc="photons before each epoch of light_sampling=photon; 0: half its paths"
+        0,
+        0,
+        1 << 28,
+        doc="photons before each epoch of light_sampling=photon; 0: a quarter of its paths",
     )
     photon_cell: float = _number(
-        0.05, 1e-6, 1e6, doc="edge of the smallest cells of photons, by the distance to the camera"
+        0.1, 1e-6, 1e6, doc="edge of the smallest cells of photons, by the distance to the camera"
     )
     photon_floor: float = _number(
-        0.3, 1e-3, 1.0, doc="least share of the shadow rays that go where no photon said so"
+        0.2, 1e-3, 1.0, doc="least share of the shadow rays that go where no photon said so"
     )
-    photon_over: str = _choice("hierarchy", "power", doc="how the lights of those are picked")
     direct_sampling: str = _choice(
         "mis", "light", "bsdf", doc="direct light by both strategies, or by one of them alone"
     )

@@ -192,7 +192,7 @@ def test_refitted_tree_finds_lights_where_they_have_moved_to(plant):
     moved = random_table(100, seed=8)
     moved["kind"] = table["kind"]
     planted.device.write(planted.lights, moved)
-    planted.tree.fit()
+    planted.tree.fit(moved)
     points = random_points(200, seed=9)
     chances = planted.chances(points)
     assert chances[reaches(moved, points)].min() > 1e-30

@@ -63,11 +63,11 @@ def test_photons_are_shared_out_by_the_power_of_the_lamps(opened):
     _, counts, words = read_map(opened)
     bits = int(opened.params[0]["node_bits"])
     node = words & np.uint32((1 << bits) - 1)
-    groups = opened.device.read(opened.buffers["light_groups"])
-    assert len(np.unique(groups)) == 2  # Two lamps of two triangles each: both sides of the root.
-    first = counts[(counts > 0) & (node == groups[0])].sum()
-    # Sobol' points: far closer than the 0.0017 of independent ones.
-    assert first / counts.sum() == pytest.approx(0.8, abs=0.004)
+    groups = opened.device.read(opened.buffers["light_groups"])["node"]
+    assert len(np.unique(groups)) == 4  # Two lamps of two triangles each.
+    first = counts[(counts > 0) & np.isin(node, groups[:2])].sum()
+    # Sobol' points alone are far closer: where two share a place, one stands for both.
+    assert first / counts.sum() == pytest.approx(0.8, abs=0.01)
 
 
 def test_the_same_photons_leave_the_same_map_and_the_same_image(device, opened):
@@ -79,13 +79,12 @@ def test_the_same_photons_leave_the_same_map_and_the_same_image(device, opened):
     again.close()
 
 
-@pytest.mark.parametrize("over", ["hierarchy", pytest.param("power", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("sampling", ["mis", pytest.param("light", marks=pytest.mark.slow)])
-def test_image_is_the_same_as_with_a_table(device, sampling, over):
+def test_image_is_the_same_as_with_a_table(device, sampling):
     scene = many_kinds()
     common = {"sampler": "random", "max_depth": 3, "direct_sampling": sampling}
     common["outputs"] = ["variance"]
-    guided = render(device, scene, 256, light_sampling="photon", photon_over=over, **common)
+    guided = render(device, scene, 256, light_sampling="photon", **common)
     table = render(device, scene, 1024, light_sampling="power", seed=1, **common)
     z = z_scores(guided, table, 4)
     assert np.abs(z).max() < 4.0
@@ -96,13 +95,10 @@ def test_image_is_the_same_as_with_a_table(device, sampling, over):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("over", ["hierarchy", "power"])
-def test_light_that_no_photon_saw_is_still_found(device, over):
+def test_light_that_no_photon_saw_is_still_found(device):
     # 20 of 70,000 photons: hardly a cell has both lamps, and most cells have none.
     common = {"sampler": "random", "direct_sampling": "light", "outputs": ["variance"]}
-    guided = render(
-        device, closed_room(), 4096, light_sampling="photon", photons=20, photon_over=over, **common
-    )
+    guided = render(device, closed_room(), 4096, light_sampling="photon", photons=20, **common)
     table = render(device, closed_room(), 4096, light_sampling="power", seed=1, **common)
     z = z_scores(guided, table, 4)
     assert np.abs(z).max() < 4.0

@@ -44,10 +44,9 @@
 #error "CONNECT must be 0 or 1"
 #endif
 #ifndef LIGHT_SAMPLING
-#error "LIGHT_SAMPLING must be 0 (a table of chances), 1 (a tree of lights), 2 or 3 (photons, else either)"
+#error "LIGHT_SAMPLING must be 0 (a table of chances), 1 (a tree of lights) or 2 (photons)"
 #endif
-#define LIGHT_TREE (LIGHT_SAMPLING & 1)
-#define LIGHT_PHOTONS (LIGHT_SAMPLING >= 2)
+#define LIGHT_PHOTONS (LIGHT_SAMPLING == 2)
 #ifndef LENS
 #error "LENS must be 0 (a pinhole), 1 (a lens) or 2 (parallel rays)"
 #endif

@@ -203,6 +203,16 @@ static inline Float gather_unchecked(__global const float *words, UInt at) { ret
 #endif
 #endif
 
+/// 1 / sqrt(x) within 1e-4, where only chances follow from it.
+#if W == 16 && defined(__AVX512F__)
+static inline Float rough_rsqrt(Float x)
+{
+    return __builtin_ia32_rsqrt14ps512_mask(x, (Float)(0.0f), (ushort)0xffff);
+}
+#else
+static inline Float rough_rsqrt(Float x) { return rsqrt(x); }
+#endif
+
 /// Index of the lowest set bit; `bits` is not 0.
 static inline uint lowest_bit(uint bits) { return popcount((bits - 1u) & ~bits); }
 

@@ -61,7 +61,8 @@
 #define HISTORY_SAME_VIEW 4u // the camera has not moved since
 #define GUIDE_SIDE 8u // parts of the hemisphere a side of the square
 #define GUIDE_BINS 64u
-#define PARTICLE_PLACES 128u // of a cell of the map of photons
+#define PARTICLE_PLACES 64u // of a cell of the map of photons
+#define PARTICLE_KINDS 14u // groups of lights that a cell of it knows at most
 #define PARTICLE_SIZES 3u // of cells of that map, each four times as wide as the one before
 #define BUCKET_SLOTS 64u // slots of a hash map that are probed for a key
 #define OFFSET_EPSILON 9.5367431640625e-07f // rounding error of a point, relative to its coordinates
@@ -110,9 +111,8 @@
 #define PATH_END_1 33u
 #endif
 #if LIGHT_SAMPLING >= 2
-#define PATH_PARTICLE_PLACE (PATH_END_1 + 0u) // uint; cell of photons that it was chosen from
-#define PATH_PARTICLE_PRINT (PATH_END_1 + 1u) // uint
-#define PATH_END_2 (PATH_END_1 + 2u)
+#define PATH_PARTICLE_ROW (PATH_END_1 + 0u) // uint; row of the table of photons that it was chosen by
+#define PATH_END_2 (PATH_END_1 + 1u)
 #else
 #define PATH_END_2 PATH_END_1
 #endif
@@ -498,6 +498,13 @@ typedef struct {
     uint axis[2]; // mean direction that the lights face, octahedral, 16 bits a coordinate
     uint child[2]; // index of a pair, or LEAF_BIT | index of a light, and GROUP_BIT; or NO_LIGHT
 } LightPair;
+
+/// The subtree of lights around a light that photons do not tell apart.
+typedef struct {
+    uint node; // 2 * pair + side in the tree; NO_LIGHT for none
+    float chance; // that the table of lights draws one of its lights
+    uint pad[2]; // fills the record
+} LightGroup;
 
 /// What both nodes of a LightPair have in common, to fit their parent.
 typedef struct {

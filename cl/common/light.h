@@ -196,10 +196,9 @@ static inline Float area_light_density(
 #define TREE_ARGUMENTS
 #endif
 #if LIGHT_PHOTONS
-#define CHOICE_PARAMETERS                                                                          \
-    TREE_PARAMETERS, __global const uint *light_groups, __global const uint *particle_kinds,       \
-        __global const uint *particle_sums, __global const uint *particle_runs
-#define CHOICE_ARGUMENTS TREE_ARGUMENTS, light_groups, particle_kinds, particle_sums, particle_runs
+#define CHOICE_PARAMETERS \
+    TREE_PARAMETERS, __global const LightGroup *light_groups, __global const uint *particle_table
+#define CHOICE_ARGUMENTS TREE_ARGUMENTS, light_groups, particle_table
 #else
 #define CHOICE_PARAMETERS TREE_PARAMETERS
 #define CHOICE_ARGUMENTS TREE_ARGUMENTS
@@ -211,7 +210,7 @@ typedef struct {
     Vec3 p;
     Vec3 n;
 #if LIGHT_PHOTONS
-    ParticleCell cells[PARTICLE_SIZES]; // the first: the one that answered
+    UInt row; // of the table of photons
 #endif
 } LightQuery;
 
@@ -226,70 +225,62 @@ static inline LightChoice choose_in_table(__global const Light *lights, uint lig
     return choice;
 }
 
+#if LIGHT_PHOTONS
+/// 32 bits of a number in [0, 1), the lowest ones from `more`.
+static inline UInt bits_of(Float u, UInt more)
+{
+    return to_uint(clamp(u, (Float)(0.0f), (Float)(0x1.fffffep-1f)) * 0x1p32f) ^ (more & 0xffu);
+}
+
+/// Chance that choose_light draws the group of a light.
+static inline Float group_chance(
+    __global const uint *table, __global const LightGroup *groups, Mask active, UInt row, UInt light)
+{
+    const Float kept = row_keeps(table, active & (row != NO_PLACE), row);
+    const Float share = node_chance(table, active, row, GATHER_U(groups, light, node));
+    return (1.0f - kept) * share + kept * GATHER(groups, light, chance);
+}
+#endif
+
 /// Draw a light for a surface.
 ///
-/// Of photons: a group of lights by how many of them came to the cell, then one of the group by what each
-/// might bring; but with a chance that is kept for what no photon saw, whatever photons say.  The cell that
-/// answered is left in `q`.
+/// Of photons: a group of lights by how much of what it might bring came to the cell, but with a chance that
+/// is kept for what no photon saw, by its power; then one of the group by what each might bring.
 static inline LightChoice choose_light(
     __global const Params *params,
     __global const Light *lights CHOICE_PARAMETERS,
     Mask active,
-    LightQuery *q,
+    LightQuery q,
     UInt bits)
 {
     const uint count = params->light_count;
 #if LIGHT_PHOTONS
-    UInt group;
-    Float kept;
-    Mask blind;
-    Float share = choose_particle(params, particle_kinds, particle_sums, particle_runs, active, q->cells,
-                                  &bits, &group, &kept, &blind);
-    const Mask known = kept < 1.0f;
-    const Mask seen = active & !blind;
-    const UInt pair = pick_u(seen, group >> 1, (UInt)(0u));
+    const Mask known = active & (q.row != NO_PLACE);
+    const Float kept = row_keeps(particle_table, known, q.row);
+    Float u = unit_float(bits);
+    const Mask blind = active & (u < kept);
+    // What is left of the number is uniform either way; digits that it has run out of are made up.
+    u = pick(blind, u / kept, (u - kept) / (1.0f - kept));
+    UInt group = choose_node(particle_table, known & !blind, q.row, &u);
+    bits = mix_bits(bits + 0x9e3779b9u);
+    if (any_lane(blind)) {
+        const LightChoice any = choose_in_table(lights, count, bits_of(u, bits));
+        group = pick_u(blind, GATHER_U(light_groups, any.light, node), group);
+        bits = mix_bits(bits);
+    }
+    bits = pick_u(blind, bits, bits_of(u, bits));
+    const Mask there = active & (group != NO_LIGHT);
+    const UInt pair = pick_u(there, group >> 1, (UInt)(0u));
     const UInt node = pick_u((group & 1u) == 0u, GATHER_U(light_pairs, pair, child[0]),
                              GATHER_U(light_pairs, pair, child[1]));
+    const TreeChoice drawn = descend_tree(light_pairs, count, there, node, q.p, q.n, bits);
     LightChoice choice;
-    Float blindly;
-#if LIGHT_TREE
-    TreeChoice drawn =
-        descend_tree(light_pairs, count, active, pick_u(seen, node, (UInt)(0u)), q->p, q->n, bits);
-    choice.light = drawn.light;
-    if (any_lane(seen)) {
-        const TreeChoice above = climb_tree(light_pairs, light_places, count, 1, seen, group, q->p, q->n);
-        drawn.above = pick(seen, above.above, drawn.above);
-    }
-    blindly = drawn.above * drawn.inside;
-    Float inside = drawn.inside;
-#else
-    const LightChoice any = choose_in_table(lights, count, bits);
-    Float inside = (Float)(1.0f);
-    choice.light = any.light;
-    if (any_lane(seen)) {
-        const TreeChoice drawn = descend_tree(light_pairs, count, seen, node, q->p, q->n, bits);
-        choice.light = pick_u(seen, drawn.light, choice.light);
-        inside = drawn.inside;
-    }
-    if (any_lane(blind & known)) {
-        const UInt place = GATHER_WORD(light_places, choice.light);
-        const TreeChoice drawn =
-            climb_tree(light_pairs, light_places, count, 0, blind & known, place, q->p, q->n);
-        inside = pick(blind, drawn.inside, inside);
-    }
-    blindly = GATHER(lights, choice.light, pmf);
-#endif
-    if (any_lane(blind & known)) {
-        const UInt its_group = GATHER_WORD(light_groups, choice.light);
-        Float unused;
-        const Float its_share = particle_chance(params, particle_kinds, particle_sums, particle_runs,
-                                                blind & known, q->cells[0], its_group, &unused);
-        share = pick(blind, its_share, share);
-    }
-    choice.pmf = pick(known, (1.0f - kept) * share * inside + kept * blindly, blindly);
+    choice.light = pick_u(there, drawn.light, (UInt)(0u));
+    const Float chance = group_chance(particle_table, light_groups, there, q.row, choice.light);
+    choice.pmf = pick(there, chance * drawn.inside, (Float)(0.0f));
     return choice;
 #elif LIGHT_SAMPLING
-    const TreeChoice drawn = descend_tree(light_pairs, count, active, (UInt)(0u), q->p, q->n, bits);
+    const TreeChoice drawn = descend_tree(light_pairs, count, active, (UInt)(0u), q.p, q.n, bits);
     LightChoice choice;
     choice.light = drawn.light;
     choice.pmf = pick(active, drawn.above * drawn.inside, (Float)(0.0f));
@@ -310,21 +301,15 @@ static inline Float light_chance(
 #if LIGHT_SAMPLING
     const UInt wanted = pick_u(active, light, (UInt)(0u));
     const UInt place = GATHER_WORD(light_places, wanted);
-    const TreeChoice drawn = climb_tree(light_pairs, light_places, params->light_count, LIGHT_TREE, active,
-                                        place, q.p, q.n);
-#endif
-#if LIGHT_TREE
-    const Float blindly = drawn.above * drawn.inside;
-#else
-    const Float blindly = GATHER(lights, light, pmf);
-#endif
+    const TreeChoice drawn = climb_tree(light_pairs, light_places, params->light_count,
+                                        LIGHT_PHOTONS ? (Mask)(0) : MASK_ALL, active, place, q.p, q.n);
 #if LIGHT_PHOTONS
-    Float kept;
-    const Float share = particle_chance(params, particle_kinds, particle_sums, particle_runs, active,
-                                        q.cells[0], GATHER_WORD(light_groups, wanted), &kept);
-    return pick(kept < 1.0f, (1.0f - kept) * share * drawn.inside + kept * blindly, blindly);
+    return drawn.inside * group_chance(particle_table, light_groups, active, q.row, wanted);
 #else
-    return blindly;
+    return drawn.above * drawn.inside;
+#endif
+#else
+    return GATHER(lights, light, pmf);
 #endif
 }
 

@@ -29,29 +29,49 @@ static inline Float cosine_of_difference(Float cos_a, Float sin_a, Float cos_b, 
     return pick(less, (Float)(1.0f), cos_a * cos_b + sin_a * sin_b);
 }
 
-/// Bound of the light that node `side` of a pair, of this power, brings to a surface at `p` with normal
-/// `n`, unoccluded.
-static inline Float node_importance(
-    __global const LightPair *pairs, UInt pair, uint side, Float power, Vec3 p, Vec3 n)
+// Words of a LightPair before an array of its members.
+#define PAIR_WORDS ((uint)(sizeof(LightPair) / 4u))
+#define WORDS_BEFORE(member) ((uint)((size_t)(((__global LightPair *)0)->member) / 4u))
+
+/// A member of a node, which is 2 * pair + side; the other node's is `stride` words away.
+static inline Float node_word(__global const LightPair *pairs, UInt node, uint word, uint stride)
 {
-    const Float radius = GATHER(pairs, pair, radius[side]);
-    const Vec3 center = vec3(GATHER(pairs, pair, center[side][0]), GATHER(pairs, pair, center[side][1]),
-                             GATHER(pairs, pair, center[side][2]));
-    const Vec3 axis = unpack_unit(GATHER_U(pairs, pair, axis[side]));
-    const Float cos_spread = GATHER(pairs, pair, cos_spread[side]);
-    const Float sin_spread = sqrt(max(1.0f - cos_spread * cos_spread, 0.0f));
+    const UInt at = (node >> 1) * PAIR_WORDS + (node & 1u) * stride + word;
+    return gather_words((__global const float *)pairs, at);
+}
+
+/// Power of all lights of a node.
+static inline Float node_power(__global const LightPair *pairs, UInt node)
+{
+    return node_word(pairs, node, WORDS_BEFORE(power), 1u);
+}
+
+static inline Float rough_root(Float x) { return x * rough_rsqrt(max(x, 1e-30f)); }
+
+/// Bound of the light that a node of this power brings to a surface at `p` with normal `n`, unoccluded.
+static inline Float node_importance(__global const LightPair *pairs, UInt node, Float power, Vec3 p, Vec3 n)
+{
+    const uint at = WORDS_BEFORE(center);
+    const Float radius = node_word(pairs, node, WORDS_BEFORE(radius), 1u);
+    const Vec3 center = vec3(node_word(pairs, node, at, 3u), node_word(pairs, node, at + 1u, 3u),
+                             node_word(pairs, node, at + 2u, 3u));
+    const Vec3 axis = unpack_direction(as_bits(node_word(pairs, node, WORDS_BEFORE(axis), 1u)));
+    const Float cos_spread = node_word(pairs, node, WORDS_BEFORE(cos_spread), 1u);
+    const Float sin_spread = rough_root(1.0f - cos_spread * cos_spread);
 
     const Vec3 toward = sub(center, p);
     const Float d2 = dot3(toward, toward);
-    const Vec3 wi = normalize3(toward);
+    const Float r2 = radius * radius;
+    // From inside of the sphere as from its surface.
+    const Float inverse = rough_rsqrt(max(max(d2, r2), 1e-37f));
+    const Vec3 wi = scale(toward, inverse);
     // The sphere hides an angle of up to half a turn, or everything from inside.
-    const Float share = min(radius * radius / max(d2, 1e-37f), (Float)(1.0f));
-    const Mask inside = share >= 1.0f;
-    const Float sin_sphere = pick(inside, (Float)(0.0f), sqrt(share));
-    const Float cos_sphere = pick(inside, (Float)(-1.0f), sqrt(1.0f - share));
+    const Mask inside = d2 <= r2;
+    const Float sin_sphere = pick(inside, (Float)(0.0f), min(radius * inverse, (Float)(1.0f)));
+    const Float cos_sphere = pick(inside, (Float)(-1.0f), rough_root(1.0f - sin_sphere * sin_sphere));
 
-    const Float cos_axis = clamp(-dot3(axis, wi), (Float)(-1.0f), (Float)(1.0f));
-    const Float sin_axis = sqrt(1.0f - cos_axis * cos_axis);
+    const Float cos_axis = clamp(-dot3(axis, wi) * rough_rsqrt(dot3(axis, axis)), (Float)(-1.0f), (Float)(1.0f));
+    const Float sin_axis = rough_root(1.0f - cos_axis * cos_axis);
     Float sine;
     Float cosine = cosine_of_difference(cos_axis, sin_axis, cos_spread, sin_spread, &sine);
     const Float leaves = cosine_of_difference(cosine, sine, cos_sphere, sin_sphere, &sine);
@@ -61,11 +81,10 @@ static inline Float node_importance(
 #else
     const Float cos_normal = clamp(dot3(n, wi), (Float)(-1.0f), (Float)(1.0f));
 #endif
-    const Float sin_normal = sqrt(1.0f - cos_normal * cos_normal);
+    const Float sin_normal = rough_root(1.0f - cos_normal * cos_normal);
     const Float falls =
         cosine_of_difference(cos_normal, sin_normal, cos_sphere, sin_sphere, &sine) + HORIZON_SLACK;
-    const Float bound = power * max(leaves, 0.0f) * max(falls, 0.0f)
-                        / max(max(d2, radius * radius), 1e-37f);
+    const Float bound = power * max(leaves, 0.0f) * max(falls, 0.0f) * inverse * inverse;
     return pick(radius < INFINITY, min(bound, 1e30f), power);
 }
 
@@ -74,10 +93,11 @@ static inline Float node_importance(
 /// Where the bound of the pair was too high and neither brings any light, their powers decide.
 LARGE_FUNCTION Float left_chance(__global const LightPair *pairs, UInt pair, Vec3 p, Vec3 n)
 {
-    const Float left_power = GATHER(pairs, pair, power[0]);
-    const Float right_power = GATHER(pairs, pair, power[1]);
-    Float left = node_importance(pairs, pair, 0u, left_power, p, n);
-    Float right = node_importance(pairs, pair, 1u, right_power, p, n);
+    const UInt node = pair << 1;
+    const Float left_power = node_power(pairs, node);
+    const Float right_power = node_power(pairs, node | 1u);
+    Float left = node_importance(pairs, node, left_power, p, n);
+    Float right = node_importance(pairs, node | 1u, right_power, p, n);
     const Mask dark = !(left + right > 0.0f);
     left = pick(dark, left_power, left);
     right = pick(dark, right_power, right);
@@ -136,12 +156,12 @@ LARGE_FUNCTION TreeChoice descend_tree(
 /// Chances of the node at `place`, as 2 * pair + side, from its group and from the root.
 ///
 /// `places`: that of every light, then of every pair; NO_LIGHT for those that have none, which are never
-/// drawn.  If not `whole`, only what is inside of the group matters.
+/// drawn.  Where `whole` is not set, only what is inside of the group matters.
 LARGE_FUNCTION TreeChoice climb_tree(
     __global const LightPair *pairs,
     __global const uint *places,
     uint light_count,
-    int whole,
+    Mask whole,
     Mask active,
     UInt place,
     Vec3 p,
@@ -158,8 +178,7 @@ LARGE_FUNCTION TreeChoice climb_tree(
         const Mask left = (place & 1u) == 0u;
         const UInt child = pick_u(left, GATHER_U(pairs, pair, child[0]), GATHER_U(pairs, pair, child[1]));
         inside &= (child & GROUP_BIT) == 0u;
-        if (!whole)
-            climbs &= inside;
+        climbs &= inside | whole;
         if (!any_lane(climbs))
             break;
         const Float chance = left_chance(pairs, pair, p, n);

@@ -5,8 +5,8 @@
 // if it came from the cell that is asked for.  Random numbers are a bijection of the particles' numbers:
 // 32 bits both order them and tell them apart.
 //
-// What is asked is a table that is made of the map before the paths start: the words of a cell's places in
-// order, so that those of the same cell make a run, and sums of the particles along each run.
+// What is asked is a table that is made of the map before the paths start: a record for each row of places,
+// of the cell that most of its particles came to.
 //
 // Binder, Keller: Ray-Traced Global Illumination for Games, GTC 2019 ("stochastically hashed particle
 // maps"); Hachisuka, Jensen: Parallel Progressive Photon Mapping on GPUs, SIGGRAPH Asia Sketches 2010.
@@ -82,200 +82,190 @@ static inline UInt particle_place(ParticleCell cell, UInt node)
     return cell.place + (mix_bits(node ^ rotate(cell.print, (UInt)(7u))) & (PARTICLE_PLACES - 1u));
 }
 
-/// What a cell is worth: how many particles it has seen, and how likely the next one is of a new kind.
-///
-/// Good: The Population Frequencies of Species and the Estimation of Population Parameters, Biometrika
-/// 40, 1953: as likely as particles were the only ones of their kind.
-static inline Float chance_of_news(UInt total, UInt alone)
-{
-    return (to_float(alone) + 1.0f) / (to_float(total) + 1.0f);
-}
+#define NO_PLACE 0xffffffffu // of the map, or row of the table
 
 // A larger cell is asked where this one's news are as likely as that.
 #define STALE_NEWS 0.1f
 
-/// Make the table of a cell's places and of all the cells that share them.
+// Words of a record of the table: nodes in order, then the shares of each and all before it.
+#define RECORD_PRINT 0u
+#define RECORD_LENGTH 1u // how many nodes
+#define RECORD_KEPT 2u   // chance of drawing a light whatever they say, float
+#define RECORD_NEWS 3u   // how likely the next particle is of a new kind, float
+#define RECORD_NODES 4u
+#define RECORD_SHARES (RECORD_NODES + PARTICLE_KINDS)
+#define RECORD_WORDS (RECORD_SHARES + PARTICLE_KINDS)
+
+/// Return the print of the cell that most particles of a row of places came from; `*most`: how many.
+static inline uint main_cell(
+    __global const Params *params, __global const uint *words, __global const uint *counts, uint base, uint *most)
+{
+    uint best = 0;
+    *most = 0;
+    for (uint i = base; i < base + PARTICLE_PLACES; ++i) {
+        const uint print = words[i] >> params->node_bits;
+        if (counts[i] == 0 || (*most > 0 && print == best))
+            continue;
+        uint total = 0;
+        for (uint j = i; j < base + PARTICLE_PLACES; ++j)
+            total += counts[j] > 0 && words[j] >> params->node_bits == print ? counts[j] : 0u;
+        if (total > *most) {
+            *most = total;
+            best = print;
+        }
+    }
+    return best;
+}
+
+/// Make the record of a row of places: of the cell in it that most particles came to.
 ///
-/// `kinds`: their words in order; `sums`: particles of the run up to there and with it; `runs`: at the first
-/// of a run its length << 8 | how many came alone, else 0; at the first place of all, too, << 16 how many are
-/// in use, for a search that reads no more than these.  Where nothing came all stays as it was cleared:
-/// kinds all ones, runs 0.
-static inline void tabulate_cell(
+/// Of its nodes those stay that most came from; what the others had is kept for any light.  How likely news
+/// are is Good's estimate (The Population Frequencies of Species, Biometrika 40, 1953): as likely as
+/// particles were the only ones of their kind.
+static inline void tabulate_row(
     __global const Params *params,
     __global const uint *words,
     __global const uint *counts,
-    __global uint *kinds,
-    __global uint *sums,
-    __global uint *runs,
-    uint cell)
+    __global uint *table,
+    uint row)
 {
-    const uint base = cell * PARTICLE_PLACES;
-    const uint node_bits = params->node_bits;
-    uint kind[PARTICLE_PLACES];
-    uint count[PARTICLE_PLACES];
-    uint used = 0;
+    const uint base = row * PARTICLE_PLACES;
+    uint total;
+    const uint print = main_cell(params, words, counts, base, &total);
+    uint count[PARTICLE_KINDS];
+    uint node[PARTICLE_KINDS];
+    uint length = 0;
+    uint alone = 0;
     for (uint place = base; place < base + PARTICLE_PLACES; ++place) {
-        if (counts[place] == 0)
+        const uint own = counts[place];
+        if (own == 0 || words[place] >> params->node_bits != print)
             continue;
-        const uint word = words[place];
-        uint i = used++;
-        for (; i > 0 && kind[i - 1u] > word; --i) {
-            kind[i] = kind[i - 1u];
-            count[i] = count[i - 1u];
+        alone += own == 1u;
+        // Most first; the last one gives way.
+        if (length == PARTICLE_KINDS && own <= count[PARTICLE_KINDS - 1u])
+            continue;
+        uint at = length < PARTICLE_KINDS ? length++ : PARTICLE_KINDS - 1u;
+        for (; at > 0 && count[at - 1u] < own; --at) {
+            count[at] = count[at - 1u];
+            node[at] = node[at - 1u];
         }
-        kind[i] = word;
-        count[i] = counts[place];
+        count[at] = own;
+        node[at] = words[place] & ((1u << params->node_bits) - 1u);
     }
-    uint i = 0;
-    while (i < used) {
-        const uint first = i;
-        uint sum = 0;
-        uint alone = 0;
-        for (; i < used && kind[i] >> node_bits == kind[first] >> node_bits; ++i) {
-            sum += count[i];
-            alone += count[i] == 1u;
-            kinds[base + i] = kind[i];
-            sums[base + i] = sum;
-            runs[base + i] = 0;
+    for (uint i = 1; i < length; ++i) {
+        const uint own = count[i];
+        const uint its_node = node[i];
+        uint at = i;
+        for (; at > 0 && node[at - 1u] > its_node; --at) {
+            count[at] = count[at - 1u];
+            node[at] = node[at - 1u];
         }
-        runs[base + first] = (i - first) << 8 | alone | (first == 0 ? used << 16 : 0u);
+        count[at] = own;
+        node[at] = its_node;
     }
+    uint kept_of = 0;
+    for (uint i = 0; i < length; ++i)
+        kept_of += count[i];
+    __global uint *record = table + row * RECORD_WORDS;
+    uint up_to = 0;
+    for (uint i = 0; i < length; ++i) {
+        up_to += count[i];
+        record[RECORD_NODES + i] = node[i];
+        record[RECORD_SHARES + i] = as_uint((float)up_to / (float)kept_of);
+    }
+    const float news = ((float)alone + 1.0f) / ((float)total + 1.0f);
+    const float lost = (float)(total - kept_of) / (float)max(total, 1u);
+    record[RECORD_PRINT] = print;
+    record[RECORD_LENGTH] = length;
+    record[RECORD_KEPT] = as_uint(min(max(news, params->photon_floor) + lost, 1.0f));
+    record[RECORD_NEWS] = as_uint(news);
 }
 
-/// The particles of a cell in the table, per lane.
-typedef struct {
-    UInt length; // places of its run; 0 where none came
-    UInt total;  // particles
-    Float news;  // how likely the next one is of a new kind
-} ParticleRun;
-
-/// Return how many of the `length` values from `first` on are less than `limit`; they rise.
-static inline UInt count_below(__global const uint *values, UInt first, UInt length, UInt limit)
+static inline UInt record_word(__global const uint *table, UInt row, uint word)
 {
-    UInt count = 0;
-    for (uint step = PARTICLE_PLACES; step > 0; step >>= 1) {
+    return GATHER_WORD(table, row * RECORD_WORDS + word);
+}
+
+static inline Float record_float(__global const uint *table, UInt row, uint word)
+{
+    return from_bits(record_word(table, row, word));
+}
+
+/// Return the row of the smallest cell of all sizes around `p` that knows enough; NO_PLACE where none knows
+/// anything.
+static inline UInt find_row(
+    __global const Params *params, __global const uint *table, Mask active, Vec3 p, Vec3 ng)
+{
+    UInt row = (UInt)(NO_PLACE);
+    Mask asks = active;
+    for (uint size = 0; size < PARTICLE_SIZES && any_lane(asks); ++size) {
+        const ParticleCell cell = particle_cell(params, p, ng, size);
+        const UInt asked = cell.place / PARTICLE_PLACES;
+        const Mask found = asks & (record_word(table, asked, RECORD_PRINT) == cell.print)
+                           & (record_word(table, asked, RECORD_LENGTH) > 0u);
+        row = pick_u(found, asked, row);
+        asks &= !(found & (record_float(table, asked, RECORD_NEWS) < STALE_NEWS));
+    }
+    return row;
+}
+
+/// Chance of drawing any light, whatever the particles of a row say.
+static inline Float row_keeps(__global const uint *table, Mask known, UInt row)
+{
+    return pick(known, record_float(table, pick_u(known, row, (UInt)(0u)), RECORD_KEPT), (Float)(1.0f));
+}
+
+/// Share of the node `i` of a row.
+static inline Float node_share(__global const uint *table, UInt row, UInt i)
+{
+    const UInt at = row * RECORD_WORDS + RECORD_SHARES + i;
+    const Float before = from_bits(GATHER_WORD(table, pick_u(i > 0u, at - 1u, at)));
+    return from_bits(GATHER_WORD(table, at)) - pick(i > 0u, before, (Float)(0.0f));
+}
+
+/// Return how many of the `length` words from `first` on are less than `limit`; they rise.
+///
+/// Of floats that are not negative the bits rise too.
+static inline UInt count_below(__global const uint *words, UInt first, UInt length, UInt limit)
+{
+    UInt count = (UInt)(0u);
+    for (uint step = 16u; step > 0; step >>= 1) {
         const UInt next = count + step;
         const Mask inside = next <= length;
         if (!any_lane(inside))
             continue;
-        const UInt value = GATHER_WORD(values, first + pick_u(inside, next - 1u, (UInt)(0u)));
-        count = pick_u(inside & (value < limit), next, count);
+        const UInt word = GATHER_WORD(words, first + pick_u(inside, next - 1u, (UInt)(0u)));
+        count = pick_u(inside & (word < limit), next, count);
     }
     return count;
 }
 
-/// Return the cell as choose_particle and particle_chance know it: its place is the first of its run.
-static inline ParticleCell find_run(
-    __global const Params *params, __global const uint *kinds, __global const uint *runs, ParticleCell cell)
+/// Chance of `node` where one of a row is drawn.
+static inline Float node_chance(__global const uint *table, Mask active, UInt row, UInt node)
 {
-    const UInt used = GATHER_WORD(runs, cell.place) >> 16;
-    const UInt before = count_below(kinds, cell.place, used, cell.print << params->node_bits);
-    cell.place += min(before, (UInt)(PARTICLE_PLACES - 1u));
-    return cell;
+    const Mask known = active & (row != NO_PLACE);
+    row = pick_u(known, row, (UInt)(0u));
+    const UInt length = pick_u(known, record_word(table, row, RECORD_LENGTH), (UInt)(0u));
+    const UInt first = row * RECORD_WORDS + RECORD_NODES;
+    const UInt before = count_below(table, first, length, node);
+    const UInt i = pick_u(before < length, before, (UInt)(0u));
+    const Mask own = (before < length) & (GATHER_WORD(table, first + i) == node);
+    return pick(own, node_share(table, row, i), (Float)(0.0f));
 }
 
-/// Return the run of a cell that find_run has returned.
-static inline ParticleRun run_of_cell(
-    __global const Params *params,
-    __global const uint *kinds,
-    __global const uint *sums,
-    __global const uint *runs,
-    ParticleCell cell)
+/// Draw a node of a row by `*u` in [0, 1), of which is left what is uniform in the node; its chance is what
+/// node_chance says.
+static inline UInt choose_node(__global const uint *table, Mask active, UInt row, Float *u)
 {
-    const Mask found = GATHER_WORD(kinds, cell.place) >> params->node_bits == cell.print;
-    const UInt both = pick_u(found, GATHER_WORD(runs, cell.place), (UInt)(0u));
-    ParticleRun run;
-    run.length = both >> 8 & 0xffu;
-    const Mask known = run.length != 0u;
-    const UInt last = cell.place + pick_u(known, run.length - 1u, (UInt)(0u));
-    run.total = pick_u(known, GATHER_WORD(sums, last), (UInt)(0u));
-    run.news = chance_of_news(run.total, both & 0xffu);
-    return run;
-}
-
-/// Particles of the place `i` of the run that starts at `first`.
-static inline UInt particles_at(__global const uint *sums, UInt first, UInt i)
-{
-    const UInt before = GATHER_WORD(sums, first + pick_u(i > 0u, i - 1u, (UInt)(0u)));
-    return GATHER_WORD(sums, first + i) - pick_u(i > 0u, before, (UInt)(0u));
-}
-
-/// Chance of `node` among the particles of a cell that find_run has returned; `*kept` that of drawing a light
-/// whatever they say.
-LARGE_FUNCTION Float particle_chance(
-    __global const Params *params,
-    __global const uint *kinds,
-    __global const uint *sums,
-    __global const uint *runs,
-    Mask active,
-    ParticleCell cell,
-    UInt node,
-    Float *kept)
-{
-    cell.place = pick_u(active, cell.place, (UInt)(0u));
-    const ParticleRun run = run_of_cell(params, kinds, sums, runs, cell);
-    const Mask known = active & (run.length != 0u);
-    const UInt word = particle_word(params, cell, node);
-    const UInt before = count_below(kinds, cell.place, run.length, word);
-    const UInt i = pick_u(known & (before < run.length), before, (UInt)(0u));
-    const Mask own = known & (GATHER_WORD(kinds, cell.place + i) == word);
-    *kept = pick(known, max(run.news, params->photon_floor), (Float)(1.0f));
-    return pick(own, to_float(particles_at(sums, cell.place, i)) / to_float(run.total), (Float)(0.0f));
-}
-
-/// Draw the node of one of the particles by their counts, and of 32 random bits whether to draw one.
-///
-/// `cells`: those of all sizes; the smallest that knows enough answers, and is left in cells[0] as find_run
-/// returns it.  `*kept` as particle_chance has it; `*blind` where a light is to be drawn whatever particles
-/// say; `*bits` is uniform again.
-LARGE_FUNCTION Float choose_particle(
-    __global const Params *params,
-    __global const uint *kinds,
-    __global const uint *sums,
-    __global const uint *runs,
-    Mask active,
-    ParticleCell *cells,
-    UInt *bits,
-    UInt *node,
-    Float *kept,
-    Mask *blind)
-{
-    ParticleCell cell = cells[0];
-    ParticleRun run;
-    run.length = (UInt)(0u);
-    run.total = (UInt)(0u);
-    run.news = (Float)(1.0f);
-    Mask asks = active;
-    for (uint size = 0; size < PARTICLE_SIZES && any_lane(asks); ++size) {
-        const ParticleCell wider = find_run(params, kinds, runs, cells[size]);
-        const ParticleRun found = run_of_cell(params, kinds, sums, runs, wider);
-        cell.place = pick_u(asks, wider.place, cell.place);
-        cell.print = pick_u(asks, wider.print, cell.print);
-        run.length = pick_u(asks, found.length, run.length);
-        run.total = pick_u(asks, found.total, run.total);
-        run.news = pick(asks, found.news, run.news);
-        asks = asks & (found.news >= STALE_NEWS);
-    }
-    cells[0] = cell;
-    const Mask known = active & (run.length != 0u);
-    const Float blindly = max(run.news, params->photon_floor);
-    *kept = pick(known, blindly, (Float)(1.0f));
-    // What is left of the number is uniform either way; digits that it has run out of are made up.
-    const Float u = to_float(*bits >> 8) * 0x1p-24f;
-    const Mask low = u < blindly;
-    const Mask seen = known & !low;
-    *blind = active & !seen;
-    const Float rest = pick(low, u / blindly, (u - blindly) / (1.0f - blindly));
-    const UInt fresh =
-        to_uint(clamp(rest, (Float)(0.0f), (Float)(0x1.fffffep-1f)) * 0x1p32f) ^ (*bits & 0xffu);
-    *bits = pick_u(known, fresh, *bits);
-    *node = (UInt)(0u);
-    if (!any_lane(seen))
-        return (Float)(0.0f);
-    const UInt first = pick_u(seen, cell.place, (UInt)(0u));
-    const UInt above = mul_hi(fresh, run.total);
-    const UInt i = pick_u(seen, count_below(sums, first, run.length, above + 1u), (UInt)(0u));
-    *bits = pick_u(seen, (fresh ^ (fresh >> 15)) * 0x2c1b3c6du, *bits);
-    *node = pick_u(seen, GATHER_WORD(kinds, first + i) & ((1u << params->node_bits) - 1u), (UInt)(0u));
-    return pick(seen, to_float(particles_at(sums, first, i)) / to_float(run.total), (Float)(0.0f));
+    row = pick_u(active, row, (UInt)(0u));
+    const UInt length = pick_u(active, record_word(table, row, RECORD_LENGTH), (UInt)(0u));
+    const UInt first = row * RECORD_WORDS;
+    // Above 0: a node without a share is not drawn.
+    const UInt below = count_below(table, first + RECORD_SHARES, length, as_bits(*u + 0x1p-25f));
+    const UInt i = min(below, pick_u(length > 0u, length - 1u, (UInt)(0u)));
+    const UInt at = first + RECORD_SHARES + i;
+    const Float before =
+        pick(i > 0u, from_bits(GATHER_WORD(table, pick_u(i > 0u, at - 1u, at))), (Float)(0.0f));
+    *u = pick(active, (*u - before) / max(node_share(table, row, i), 1e-9f), *u);
+    return GATHER_WORD(table, first + RECORD_NODES + i);
 }

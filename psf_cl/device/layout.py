@@ -391,6 +391,16 @@ LIGHT_PAIR = Record(
     """),
 )
 
+LIGHT_GROUP = Record(
+    "LightGroup",
+    "The subtree of lights around a light that photons do not tell apart.",
+    _fields("""
+    uint node - 2 * pair + side in the tree; NO_LIGHT for none
+    float chance - that the table of lights draws one of its lights
+    uint pad[2] - fills the record
+    """),
+)
+
 LIGHT_BOUNDS = Record(
     "LightBounds",
     "What both nodes of a LightPair have in common, to fit their parent.",
@@ -623,6 +633,7 @@ RECORDS = (
     TEXTURE,
     LIGHT,
     LIGHT_PAIR,
+    LIGHT_GROUP,
     LIGHT_BOUNDS,
     ENVIRONMENT_CELL,
     FILM_SUM,
@@ -689,10 +700,7 @@ OPTIONAL_PATH_FIELDS = (
     (
         "LIGHT_SAMPLING",
         2,
-        (
-            ("particle_place", "uint; cell of photons that it was chosen from"),
-            ("particle_print", "uint"),
-        ),
+        (("particle_row", "uint; row of the table of photons that it was chosen by"),),
     ),
     (
         "BASE",
@@ -892,7 +900,8 @@ CONSTANTS = (
     ("HISTORY_SAME_VIEW", 4, "the camera has not moved since"),
     ("GUIDE_SIDE", GUIDE_SIDE, "parts of the hemisphere a side of the square"),
     ("GUIDE_BINS", GUIDE_SIDE**2, ""),
-    ("PARTICLE_PLACES", 128, "of a cell of the map of photons"),
+    ("PARTICLE_PLACES", 64, "of a cell of the map of photons"),
+    ("PARTICLE_KINDS", 14, "groups of lights that a cell of it knows at most"),
     ("PARTICLE_SIZES", 3, "of cells of that map, each four times as wide as the one before"),
     ("BUCKET_SLOTS", 64, "slots of a hash map that are probed for a key"),
 )

@@ -17,11 +17,14 @@ if TYPE_CHECKING:
     from psf_cl.traits import DeviceTraits
 
 #: Photons of an epoch if it is not said how many: as many as a share of its camera paths.
-SHARE_OF_PATHS = 0.5
-FEWEST, MOST = 1 << 15, 1 << 20
+SHARE_OF_PATHS = 0.25
+FEWEST, MOST = 1 << 14, 1 << 20
 
 #: Cells of the map, a power of two.
 CELLS = 1 << 15
+
+#: Words of what the table knows of a cell.
+RECORD_WORDS = 4 + 2 * layout.CONSTANT["PARTICLE_KINDS"]
 
 
 def photons_for(settings: Settings, passes: int, pixel_count: int) -> int:
@@ -87,11 +90,7 @@ def plan(context: Context) -> StageSpec | None:
             BufferSpec("particle_keys", uint32, places, "least random number of each place"),
             BufferSpec("particle_counts", uint32, places, "photons that came to it"),
             BufferSpec("particle_words", uint32, places, "light and cell of the one that stayed"),
-            BufferSpec("particle_kinds", uint32, places, "these in order, as runs of cells"),
-            BufferSpec("particle_sums", uint32, places, "photons of the run up to each"),
-            BufferSpec(
-                "particle_runs", uint32, places, "length of each run, and how many came alone"
-            ),
+            BufferSpec("particle_table", uint32, CELLS * RECORD_WORDS, "what each cell knows"),
         ),
         per_pass=True,
         between_passes=True,
@@ -125,10 +124,10 @@ class PhotonMap:
 
     def clear(self) -> None:
         """Forget all photons."""
-        for name in ("particle_keys", "particle_kinds"):
-            self.device.fill(self.buffers[name], 0xFF)
-        for name in ("particle_counts", "particle_words", "particle_runs", "photon_counters"):
-            self.device.fill(self.buffers[name])
+        self.device.fill(self.buffers["particle_keys"], 0xFF)
+        for name in ("counts", "words", "table"):
+            self.device.fill(self.buffers[f"particle_{name}"])
+        self.device.fill(self.buffers["photon_counters"])
 
     def add(self, count: int) -> None:
         """Emit ``count`` photons and enqueue that the map and its table keep them."""

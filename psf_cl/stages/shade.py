@@ -68,7 +68,7 @@ def _kernel(context: Context) -> KernelSpec:
         shadow += ("base_light",)
     chosen: tuple[str, ...] = ("light_normal",) if context.on("LIGHT_SAMPLING") else ()
     if context.features["LIGHT_SAMPLING"].value >= 2:
-        chosen += ("particle_place", "particle_print")
+        chosen += ("particle_row",)
     guided = ("guide", "expected") if context.on("GUIDE") else ()
     if guided and shadow:
         shadow += ("guide_from", "guide_light")

@@ -17,9 +17,9 @@ kernel void draw_lights(
     const Vec3 p = LOAD_V(points, 0);
     const Vec3 n = LOAD_V(points, 3);
     const TreeChoice choice = descend_tree(light_pairs, light_count, MASK_ALL, (UInt)(0u), p, n, LOAD_U(bits, 0));
-    const TreeChoice back = climb_tree(light_pairs, light_places, light_count, 1, MASK_ALL,
+    const TreeChoice back = climb_tree(light_pairs, light_places, light_count, MASK_ALL, MASK_ALL,
                                        GATHER_WORD(light_places, choice.light), p, n);
-    const TreeChoice inside = climb_tree(light_pairs, light_places, light_count, 0, MASK_ALL,
+    const TreeChoice inside = climb_tree(light_pairs, light_places, light_count, (Mask)(0), MASK_ALL,
                                          GATHER_WORD(light_places, choice.light), p, n);
     STORE_U(drawn, 0, choice.light);
     STORE(pmfs, 0, choice.above * choice.inside);
@@ -36,7 +36,7 @@ kernel void list_chances(
     global float *chances)
 {
     const UInt place = GATHER_WORD(light_places, LOAD_U(light, 0));
-    const TreeChoice choice = climb_tree(light_pairs, light_places, light_count, 1, MASK_ALL, place,
+    const TreeChoice choice = climb_tree(light_pairs, light_places, light_count, MASK_ALL, MASK_ALL, place,
                                          LOAD_V(points, 0), LOAD_V(points, 3));
     STORE(chances, 0, choice.above * choice.inside);
 }

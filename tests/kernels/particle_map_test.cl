@@ -42,64 +42,58 @@ kernel void settle_particles(
             words[lane_place[k]] = lane_word[k];
 }
 
-/// The table of each cell's places: one work item W of those in `rows`.
+/// The table of the places: one work item W rows of them.
 kernel void tabulate(
     global const Params *params,
     global const uint *words,
     global const uint *counts,
-    global uint *kinds,
-    global uint *sums,
-    global uint *runs,
+    global uint *table,
     global const uint *rows)
 {
     for (uint k = 0; k < W; ++k)
-        tabulate_cell(params, words, counts, kinds, sums, runs, rows[get_global_id(0) * W + k]);
+        tabulate_row(params, words, counts, table, rows[get_global_id(0) * W + k]);
 }
 
-/// Share of the particles of a cell that are from below a node.
+/// Row of a cell, if that is what the row tells of.
+static UInt row_of(global const Params *params, global const uint *table, UInt number)
+{
+    const ParticleCell cell = cell_of_hash(params, mix_bits(number));
+    const UInt row = cell.place / PARTICLE_PLACES;
+    const Mask own = (record_word(table, row, RECORD_PRINT) == cell.print)
+                     & (record_word(table, row, RECORD_LENGTH) > 0u);
+    return pick_u(own, row, (UInt)(NO_PLACE));
+}
+
+/// Chance of a node among those of a cell, and of any light.
 kernel void list_shares(
     global const Params *params,
-    global const uint *kinds,
-    global const uint *sums,
-    global const uint *runs,
+    global const uint *table,
     global const uint *cells,
     global const uint *nodes,
     global float *shares,
     global float *kept)
 {
-    Float rest;
-    const ParticleCell cell = find_run(params, kinds, runs, cell_of_hash(params, mix_bits(LOAD_U(cells, 0))));
-    STORE(shares, 0, particle_chance(params, kinds, sums, runs, MASK_ALL, cell, LOAD_U(nodes, 0), &rest));
-    STORE(kept, 0, rest);
+    const UInt row = row_of(params, table, LOAD_U(cells, 0));
+    STORE(shares, 0, node_chance(table, MASK_ALL, row, LOAD_U(nodes, 0)));
+    STORE(kept, 0, row_keeps(table, row != NO_PLACE, row));
 }
 
-/// A draw of `bits`: what is kept, whether it is blind, and of the others the node and its chance.
+/// A draw by a number, what is left of it, and the chance of the node.
 kernel void draw_particles(
     global const Params *params,
-    global const uint *kinds,
-    global const uint *sums,
-    global const uint *runs,
+    global const uint *table,
     global const uint *cells,
-    global const uint *bits,
+    global const float *numbers,
     global uint *nodes,
-    global uint *blinds,
-    global float *chances,
-    global float *kept,
-    global float *again)
+    global float *left,
+    global float *chances)
 {
-    const ParticleCell cell = cell_of_hash(params, mix_bits(LOAD_U(cells, 0)));
-    ParticleCell sizes[PARTICLE_SIZES];
-    for (uint size = 0; size < PARTICLE_SIZES; ++size)
-        sizes[size] = cell;
-    UInt random = LOAD_U(bits, 0);
-    UInt node;
-    Float rest;
-    Mask blind;
-    STORE(chances, 0, choose_particle(params, kinds, sums, runs, MASK_ALL, sizes, &random, &node, &rest, &blind));
-    STORE(kept, 0, rest);
+    const UInt row = row_of(params, table, LOAD_U(cells, 0));
+    Float u = LOAD(numbers, 0);
+    const UInt node = choose_node(table, row != NO_PLACE, row, &u);
     STORE_U(nodes, 0, node);
-    STORE_U(blinds, 0, pick_u(blind, (UInt)(1u), (UInt)(0u)));
-    STORE(again, 0, particle_chance(params, kinds, sums, runs, MASK_ALL, sizes[0], node, &rest));
+    STORE(left, 0, u);
+    STORE(chances, 0, node_chance(table, MASK_ALL, row, node));
 }
 
 /// The first place of each cell, and what tells its particles from others.
