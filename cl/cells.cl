@@ -15,6 +15,47 @@
 #include "common/shared_samples.h"
 #include "common/walls.h"
 
+#if SPARSE
+/// Count the samples of complete passes where they would be stored.  One work item W pixels, RUN times, first
+/// of all.
+///
+/// reads   beyond, vertices, counters
+/// writes  crowds (atomic)
+kernel void count_crowds(
+    __global const Params *params,
+    __global const Beyond *beyond,
+    __global const CellVertex *vertices,
+    const volatile __global uint *counters,
+    volatile __global uint *crowds)
+{
+    const uint first = get_global_id(0) * (W * RUN);
+    const uint end = min(first + W * RUN, params->pixel_count);
+    const uint passes = first < end ? complete_passes(params, counters) : 0u;
+    for (uint k = 0; k < passes; ++k) {
+        const PassPlace place = place_of(params, counters[COUNTER_FILM_PASS] + k);
+        for (uint i = first; i < end; i += W) {
+            const UInt wanted = lanes_before(MASK_ALL) + i;
+            const Mask inside = wanted < params->pixel_count;
+            const UInt pixel = pick_u(inside, wanted, (UInt)(0u));
+            const UInt vertex = GATHER_U(beyond + place.samples, pixel, vertex);
+            const Mask there = inside & (vertex != 0u);
+            if (!any_lane(there))
+                continue;
+            const CellQuery query = load_query(params, vertices + place.samples, pixel, vertex, place.width);
+            const UInt at = entry_of(params, first_place_to_store(params, &query, pixel, place.pass));
+            uint lane_at[W];
+            store_lanes_u(at, lane_at);
+            for (uint left = lane_bits(there); left;) {
+                const uint entry = lane_at[lowest_bit(left)];
+                const uint same = left & lane_bits(at == entry);
+                left &= ~same;
+                atomic_add(&crowds[place.slots + entry], popcount(same));
+            }
+        }
+    }
+}
+#endif
+
 #if WALLS
 /// Mark the cells where samples of complete passes met something within a cell's width: those that they are
 /// stored in, and those that they are in.  One work item W pixels, RUN times, before store_cells.
@@ -26,7 +67,7 @@ kernel void mark_near_cells(
     __global const Beyond *beyond,
     __global const CellVertex *vertices,
     const volatile __global uint *counters,
-    __global uint *near_cells)
+    __global uint *near_cells CROWD_BUFFERS)
 {
     const uint first = get_global_id(0) * (W * RUN);
     const uint end = min(first + W * RUN, params->pixel_count);
@@ -43,8 +84,12 @@ kernel void mark_near_cells(
             if (!any_lane(near))
                 continue;
             const CellQuery query = load_query(params, vertices + place.samples, pixel, vertex, place.width);
-            mark_cells(params, marks, near, place_to_store(params, &query, pixel, place.pass), place.pass);
-            mark_cells(params, marks, near, place_of_vertex(params, &query, pixel, place.pass), place.pass);
+            const CellPlace stored = place_to_store(
+                params, &query, pixel, place.pass CROWD_ARGUMENTS_OF(crowds + place.slots));
+            const CellPlace own = place_to_look_up(
+                params, &query, pixel, place.pass, 0 CROWD_ARGUMENTS_OF(crowds + place.slots));
+            mark_cells(params, marks, near, stored, place.pass);
+            mark_cells(params, marks, near, own, place.pass);
         }
     }
 }
@@ -68,7 +113,7 @@ static inline void store_samples(
 #endif
     __global uint *full_buckets,
     uint first,
-    const PassPlace *place WALL_BUFFERS)
+    const PassPlace *place CROWD_BUFFERS WALL_BUFFERS)
 {
     const UInt wanted = lanes_before(MASK_ALL) + first;
     const Mask inside = wanted < params->pixel_count;
@@ -87,7 +132,7 @@ static inline void store_samples(
     if (!any_lane(there))
         return;
     const CellQuery query = load_query(params, vertices, pixel, vertex, place->width);
-    const CellPlace at = place_to_store(params, &query, pixel, place->pass);
+    const CellPlace at = place_to_store(params, &query, pixel, place->pass CROWD_ARGUMENTS);
     const UInt wall = wall_in_cell(params, there, &query, at, place->pass, pixel WALL_ARGUMENTS);
     if (any_lane(wall != 0u)) {
         uint lane_wall[W];
@@ -162,7 +207,7 @@ kernel void store_cells(
 #if AOV_CELLS
     volatile __global CellSquares *cell_squares,
 #endif
-    __global uint *full_buckets WALL_BUFFERS)
+    __global uint *full_buckets CROWD_BUFFERS WALL_BUFFERS)
 {
     const uint first = get_global_id(0) * (W * RUN);
     const uint end = min(first + W * RUN, params->pixel_count);
@@ -175,7 +220,8 @@ kernel void store_cells(
 #if AOV_CELLS
                           cell_squares + place.slots,
 #endif
-                          full_buckets + place.buckets, i, &place WALL_ARGUMENTS_OF(near_cells + place.slots));
+                          full_buckets + place.buckets, i, &place CROWD_ARGUMENTS_OF(crowds + place.slots)
+                                  WALL_ARGUMENTS_OF(near_cells + place.slots));
     }
 }
 
@@ -275,7 +321,7 @@ static inline void look_up_samples(
 #endif
     __global float *samples,
     uint first,
-    const PassPlace *place WALL_BUFFERS)
+    const PassPlace *place CROWD_BUFFERS WALL_BUFFERS)
 {
     const UInt inside = lanes_before(MASK_ALL) + first;
     const UInt pixel = pick_u(inside < params->pixel_count, inside, (UInt)(0u));
@@ -286,14 +332,15 @@ static inline void look_up_samples(
     const Mask there = wanted & ((vertex & VERTEX_REJECTED) == 0u);
     const CellQuery query = load_query(params, vertices, pixel, vertex, place->width);
     const uint size = bucket_size(params->cell_slots);
-    const CellPlace at = place_to_look_up(params, &query, pixel, place->pass);
+    const CellPlace at =
+        place_to_look_up(params, &query, pixel, place->pass, params->cell_flags & CELL_JITTER CROWD_ARGUMENTS);
     const UInt wall = wall_in_cell(params, there, &query, at, place->pass, pixel WALL_ARGUMENTS);
     CellKey key = cell_key(params, &query, at, wall);
     UInt slot = find_lanes(keys, full_buckets, there, key.bucket, size, key.key);
     const Mask empty = there & (slot == NO_SLOT);
     if (any_lane(empty)) {
         // Nothing was stored there: the cell that the sample itself went to.
-        key = cell_key(params, &query, place_to_store(params, &query, pixel, place->pass), wall_at_store(vertex));
+        key = cell_key(params, &query, place_to_store(params, &query, pixel, place->pass CROWD_ARGUMENTS), wall_at_store(vertex));
         slot = pick_u(empty, find_lanes(keys, full_buckets, empty, key.bucket, size, key.key), slot);
     }
     const Mask found = slot != NO_SLOT;
@@ -374,7 +421,7 @@ kernel void look_up_cells(
 #if RESTORE
     __global Lost *film_lost,
 #endif
-    __global float *samples WALL_BUFFERS)
+    __global float *samples CROWD_BUFFERS WALL_BUFFERS)
 {
     const uint first = get_global_id(0) * (W * RUN);
     const uint end = min(first + W * RUN, params->pixel_count);
@@ -394,7 +441,8 @@ kernel void look_up_cells(
 #if RESTORE
                             film_lost,
 #endif
-                            samples + 4 * place.samples, i, &place WALL_ARGUMENTS_OF(near_cells + place.slots));
+                            samples + 4 * place.samples, i, &place CROWD_ARGUMENTS_OF(crowds + place.slots)
+                                  WALL_ARGUMENTS_OF(near_cells + place.slots));
     }
 }
 
@@ -410,6 +458,9 @@ kernel void clear_cells(
 #if AOV_CELLS
     __global CellSquares *cell_squares,
 #endif
+#if SPARSE
+    __global uint *crowds,
+#endif
     __global uint *full_buckets)
 {
     const uint size = bucket_size(params->cell_slots);
@@ -422,6 +473,10 @@ kernel void clear_cells(
     for (uint k = 0; k < passes; ++k) {
         const PassPlace place = place_of(params, counters[COUNTER_FILM_PASS] + k);
         const ulong at = place.slots + bucket * size;
+#if SPARSE
+        for (uint i = 0; i < size; ++i)
+            crowds[at + i] = 0u;
+#endif
         if (bucket_is_empty(cell_keys + at, size))
             continue;
         for (uint i = 0; i < size; ++i) {

@@ -540,6 +540,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "guiding is off",
         ),
         "CELLS": _cells(settings, glossy),
+        "SPARSE": _sparse(settings),
         "WALLS": _walls(settings),
         "AOV_CELLS": _aov_cells(settings, outputs),
         "RESTORE": _restore(settings),
@@ -591,6 +592,15 @@ def _aov_cells(settings: Settings, outputs: frozenset[str]) -> Feature:
     if not asked:
         return Feature(0, "no image of cells was asked for")
     return Feature(1, f"{', '.join(asked)} asked for")
+
+
+def _sparse(settings: Settings) -> Feature:
+    """Return whether cells with few samples give way to wider ones."""
+    if settings.path_filter != "hash_grid":
+        return Feature(0, f"path_filter is {settings.path_filter}")
+    if settings.cell_min_count <= 1:
+        return Feature(0, "cell_min_count asks for no samples beside the own one")
+    return Feature(1, f"cell_min_count asks for {settings.cell_min_count} samples in a cell")
 
 
 def _walls(settings: Settings) -> Feature:
@@ -686,6 +696,7 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
             "CELLS",
             "RESTORE",
             "SEEN",
+            "SPARSE",
             "WALLS",
         )
         full |= {name: features[name] for name in names}

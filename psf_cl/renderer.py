@@ -1142,15 +1142,17 @@ class Renderer:
         traits, pixels = self.plan.traits, self.plan.pixel_count
         per_pixel = -(-pixels // (traits.lanes * traits.run))
         per_bucket = cells.buckets(pixels)
+        stage = next(stage for stage in self.plan.stages if stage.name == "cells")
         self.cell_launches = [
             (program.bind_planned(name, self.buffers), items)
             for name, items in (
+                ("count_crowds", per_pixel),
                 ("mark_near_cells", per_pixel),
                 ("store_cells", per_pixel),
                 ("resolve_cells", per_bucket),
                 ("look_up_cells", per_pixel),
             )
-            if name != "mark_near_cells" or self.plan.features["WALLS"].value
+            if name in stage.kernel_names
         ]
         self.clear_cells = program.bind_planned("clear_cells", self.buffers)
         self.add_unfiltered = program.bind_planned("add_unfiltered", self.buffers)

@@ -132,6 +132,9 @@ class Settings:
         doc="add what averages lost back where it stands out of the noise: consistent",
     )
     cell_size: float = _number(16.0, 1e-3, 1e6, doc="edge of a cell in the first pass, pixels")
+    cell_min_count: int = _number(
+        0, 0, 1 << 20, doc="samples of a pass below which a cell gives way to one twice as wide"
+    )
     cell_jitter: bool = _switch(
         True, doc="move points at random before cells are told apart: no blocks show"
     )

@@ -408,6 +408,35 @@ def test_a_lit_plane_is_flat_across_levels(device):
     assert 0 < image.std() < plain.std() * np.sqrt(48)
 
 
+def test_cells_with_few_samples_give_way_to_wider_ones(device):
+    """Most cells of two pixels have less than eight samples."""
+    names = ["cell_count", "filter_weight"]
+    settings = {**FILTER, "filter_vertex": "1", "cell_size": 2.0}
+
+    def view(**more):
+        image = render(device, room((48, 32)), 4, names, **settings, **more)
+        used = image.aovs["filter_weight"] == 1
+        assert used.mean() > 0.5
+        return image.rgb.mean(), image.aovs["cell_count"][used]
+
+    mean, counts = view()
+    wide_mean, wide_counts = view(cell_min_count=8)
+    assert (counts < 8).mean() > 0.5
+    assert np.median(wide_counts) > 1.5 * np.median(counts)
+    np.testing.assert_allclose(wide_mean, mean, rtol=0.01)
+    small = open_device(traits=replace(device.traits, slots=128))
+    again = render(small, room((48, 32)), 4, names, **settings, cell_min_count=8)
+    assert again.rgb.mean() == wide_mean
+
+
+def test_wider_cells_cost_nothing_where_nobody_asks_for_them():
+    def names(**settings):
+        return {b.name for b in make_plan(room(), Settings(**FILTER, **settings)).buffers}
+
+    assert "crowds" not in names() | names(cell_min_count=1)
+    assert "crowds" in names(cell_min_count=2)
+
+
 @pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "x"])
 def test_cells_without_size_are_refused(value):
     with pytest.raises(InputError, match=r"cell_size must be"):

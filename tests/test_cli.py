@@ -492,6 +492,7 @@ def test_plan_follows_the_options(all_features, capsys):
         "MOTION",
         "RESTORE",
         "SEEN",
+        "SPARSE",
         "TANGENTS",
         "TEMPORAL",
         "VERTEX_COLORS",

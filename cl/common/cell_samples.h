@@ -42,32 +42,62 @@ static inline CellQuery load_query(
     return query;
 }
 
-/// Where samples are stored.  Neighbours are moved alike: most of a tile meets in one cell, and is added
-/// to it at once.
-static inline CellPlace place_to_store(__global const Params *params, const CellQuery *query, UInt pixel, uint pass)
+#if SPARSE
+#define CROWD_BUFFERS , __global const uint *crowds
+#define CROWD_ARGUMENTS_OF(entries) , entries
+#define CROWD_ARGUMENTS , crowds
+#else
+#define CROWD_BUFFERS
+#define CROWD_ARGUMENTS_OF(entries)
+#define CROWD_ARGUMENTS
+#endif
+
+/// Return where points are; where too few samples are stored, the cell that is twice or four times as wide.
+static inline CellPlace crowded_place(
+    __global const Params *params, const CellQuery *query, UInt a, UInt b, uint jitter CROWD_BUFFERS)
+{
+    CellPlace place = cell_place(params, query, a, b, jitter, (UInt)(0u));
+#if SPARSE
+    const UInt crowd = GATHER_WORD(crowds, entry_of(params, place));
+    const UInt least = (UInt)(params->cell_min_count);
+    const Mask few = crowd < least;
+    if (any_lane(few)) {
+        const UInt raise = pick_u(few, pick_u(crowd * 4u < least, (UInt)(2u), (UInt)(1u)), (UInt)(0u));
+        place = cell_place(params, query, a, b, jitter, raise);
+    }
+#endif
+    return place;
+}
+
+/// Where samples would be stored if there were no other ones.  Neighbours are moved alike: most of a tile
+/// meets in one cell, and is added to it at once.
+static inline CellPlace first_place_to_store(
+    __global const Params *params, const CellQuery *query, UInt pixel, uint pass)
 {
     UInt a;
     UInt b;
     cell_random(params, pixel / CELL_TILE, pass, CELL_STORE, &a, &b);
-    return cell_place(params, query, a, b, params->cell_flags & CELL_JITTER);
+    return cell_place(params, query, a, b, params->cell_flags & CELL_JITTER, (UInt)(0u));
 }
 
-/// Where samples look for the average that they use.
-static inline CellPlace place_to_look_up(__global const Params *params, const CellQuery *query, UInt pixel, uint pass)
+/// Where samples are stored.
+static inline CellPlace place_to_store(
+    __global const Params *params, const CellQuery *query, UInt pixel, uint pass CROWD_BUFFERS)
+{
+    UInt a;
+    UInt b;
+    cell_random(params, pixel / CELL_TILE, pass, CELL_STORE, &a, &b);
+    return crowded_place(params, query, a, b, params->cell_flags & CELL_JITTER CROWD_ARGUMENTS);
+}
+
+/// Where samples look for the average that they use; without `jitter` where they are.
+static inline CellPlace place_to_look_up(
+    __global const Params *params, const CellQuery *query, UInt pixel, uint pass, uint jitter CROWD_BUFFERS)
 {
     UInt a;
     UInt b;
     cell_random(params, pixel, pass, CELL_LOOK_UP, &a, &b);
-    return cell_place(params, query, a, b, params->cell_flags & CELL_JITTER);
-}
-
-/// Where samples are, at the level that they look for.
-static inline CellPlace place_of_vertex(__global const Params *params, const CellQuery *query, UInt pixel, uint pass)
-{
-    UInt a;
-    UInt b;
-    cell_random(params, pixel, pass, CELL_LOOK_UP, &a, &b);
-    return cell_place(params, query, a, b, 0);
+    return crowded_place(params, query, a, b, jitter CROWD_ARGUMENTS);
 }
 
 /// What separates samples from the middle of the cell that they are stored in: 0 for nothing.

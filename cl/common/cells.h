@@ -71,14 +71,15 @@ static inline UInt nearest(Float x) { return as_bits(x + 0x1.8p23f); }
 #define CELL_SHIFT_Z -0.33f
 
 /// Return where in the grid a point is; with `jitter` it is moved in its tangent plane by up to half a cell.
+/// `raise` is added to the level.
 ///
 /// Along the two axes of the grid that the surface faces less, the move is up to half an edge either way.
 /// The level is chosen again after it, or there would be cells of levels that no point that stays has.
 static inline CellPlace cell_place(
-    __global const Params *params, const CellQuery *q, UInt random_x, UInt random_y, uint jitter)
+    __global const Params *params, const CellQuery *q, UInt random_x, UInt random_y, uint jitter, UInt raise)
 {
     const Float dither = unit_float(mix_bits(random_x ^ rotate(random_y, (UInt)(16u))));
-    UInt level = cell_level(q->width, dither);
+    UInt level = cell_level(q->width, dither) + raise;
     // The side of the cube that the normal points to: its axis w, then the two others.
     const Vec3 n = q->ng;
     const Float ax = fabs(n.x);
@@ -99,7 +100,7 @@ static inline CellPlace cell_place(
         const Vec3 before = sub(q->p, vec3_of(params->camera_origin));
         const Vec3 after = add(before, move);
         const Float ratio = sqrt(dot3(after, after) / max(dot3(before, before), 1e-30f));
-        level = cell_level(pick(q->seen, q->width * ratio, q->width), dither);
+        level = cell_level(pick(q->seen, q->width * ratio, q->width), dither) + raise;
     }
     const Float inverse = 1.0f / cell_edge(level);
     CellPlace place;
@@ -110,6 +111,14 @@ static inline CellPlace cell_place(
     place.side = pick_u(on_x, (UInt)(0u), pick_u(on_y, (UInt)(1u), (UInt)(2u)))
                  + pick_u(nw < 0.0f, (UInt)(4u), (UInt)(0u));
     return place;
+}
+
+/// Entry of a cell in tables without keys, where some cells share one.
+static inline UInt entry_of(__global const Params *params, CellPlace place)
+{
+    const UInt hash = mix_bits(place.x * 0x9e3779b1u + place.y * 0x85ebca77u + place.z * 0xc2b2ae3du
+                               + place.level * 0x27d4eb2fu + place.side * 0x165667b1u);
+    return hash & (params->cell_slots - 1u);
 }
 
 /// Middle of a cube of the grid.

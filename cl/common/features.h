@@ -83,6 +83,9 @@
 #ifndef AOV_CELLS
 #error "AOV_CELLS must be 0 or 1"
 #endif
+#ifndef SPARSE
+#error "SPARSE must be 0 or 1 (cells with few samples give way to wider ones)"
+#endif
 #ifndef WALLS
 #error "WALLS must be 0 or 1 (walls inside cells keep light apart)"
 #endif

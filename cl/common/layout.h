@@ -266,6 +266,7 @@ typedef struct {
     uint sampler; // SAMPLER_SOBOL or SAMPLER_RANDOM
     uint corner_count; // of the list of corners, where all triangles are tested
     uint face_count; // triangles between those corners
+    uint cell_min_count; // samples below which a cell gives way to a wider one
     uint cell_slots; // of the table of cells of one pass, a power of two
     uint cell_flags; // CELL_JITTER, CELL_NEAR, CELL_IDENTITY
     float cell_width; // edge of a cell in the first pass, m per m of the path
@@ -299,7 +300,6 @@ typedef struct {
     float guide_share; // of the directions of a diffuse lobe that the guide draws
     float guide_steps; // fixed-point steps of a sum of its radiance per unit, a power of two
     float guide_limit; // radiance from which a sample is too large for these sums
-    uint pad[1]; // fills the record
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.

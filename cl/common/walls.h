@@ -30,21 +30,12 @@
 #define WALL_ARGUMENTS_OF(marks) , marks SURFACE_ARGUMENT, GEOMETRY_BUFFER_ARGUMENTS
 #define WALL_ARGUMENTS WALL_ARGUMENTS_OF(near_cells)
 
-/// Where the mark of a cell is: the number of the pass after that in which something near was met.  Some
-/// cells share a place: a few rays more.
-static inline UInt place_of_mark(__global const Params *params, CellPlace place)
-{
-    const UInt hash = mix_bits(place.x * 0x9e3779b1u + place.y * 0x85ebca77u + place.z * 0xc2b2ae3du
-                               + place.level * 0x27d4eb2fu + place.side * 0x165667b1u);
-    return hash & (params->cell_slots - 1u);
-}
-
-/// Mark the cells of the lanes in `near`.
+/// Mark the cells of the lanes in `near` with the number of the pass after that in which it was.
 static inline void mark_cells(
     __global const Params *params, __global uint *near_cells, Mask near, CellPlace place, uint pass)
 {
     uint lane_at[W];
-    store_lanes_u(place_of_mark(params, place), lane_at);
+    store_lanes_u(entry_of(params, place), lane_at);
     for (uint left = lane_bits(near); left; left &= left - 1u)
         near_cells[lane_at[lowest_bit(left)]] = pass + 1u;
 }
@@ -78,7 +69,7 @@ LARGE_FUNCTION UInt wall_before(
 static inline UInt wall_in_cell(
     __global const Params *params, Mask mask, const CellQuery *query, CellPlace place, uint pass, UInt pixel WALL_BUFFERS)
 {
-    const Mask near = mask & (GATHER_WORD(near_cells, place_of_mark(params, place)) == pass + 1u);
+    const Mask near = mask & (GATHER_WORD(near_cells, entry_of(params, place)) == pass + 1u);
     if (!any_lane(near))
         return (UInt)(0u);
     return wall_before(params, near, query, place, mix_bits(pixel * 0x9e3779b9u + pass) WALL_ARGUMENTS);

@@ -107,6 +107,7 @@ PARAMS = Record(
     uint sampler - SAMPLER_SOBOL or SAMPLER_RANDOM
     uint corner_count - of the list of corners, where all triangles are tested
     uint face_count - triangles between those corners
+    uint cell_min_count - samples below which a cell gives way to a wider one
     uint cell_slots - of the table of cells of one pass, a power of two
     uint cell_flags - CELL_JITTER, CELL_NEAR, CELL_IDENTITY
     float cell_width - edge of a cell in the first pass, m per m of the path

@@ -52,6 +52,7 @@ def parameters(scene: Scene, settings: Settings, pixel_count: int) -> dict[str, 
     """Return what the kernels need to know, by the names of ``layout.PARAMS``."""
     steps = fixed_point(HEADROOM * brightest(scene), pixel_count)
     return {
+        "cell_min_count": settings.cell_min_count,
         "cell_slots": slots_of(pixel_count),
         "cell_flags": layout.CONSTANT["CELL_JITTER"] * settings.cell_jitter
         + layout.CONSTANT["CELL_NEAR"] * settings.cell_near,
@@ -140,12 +141,17 @@ def plan(context: Context) -> StageSpec | None:
             BufferSpec("cell_squares", squares, context.ring * slots, "second moments", True),
             BufferSpec("film_cells", view, context.pixel_count, "what pixels saw of cells"),
         )
+    if context.on("SPARSE"):
+        what = "samples that cells would have"
+        buffers += (BufferSpec("crowds", uint32, context.ring * slots, what, True),)
     if walls:
         what = "cells with light from near"
         buffers += (BufferSpec("near_cells", uint32, context.ring * slots, what, True),)
     sample_bytes = layout.BEYOND.dtype.itemsize + layout.CELL_VERTEX.dtype.itemsize
+    crowds = (KernelSpec("count_crowds", record_bytes=sample_bytes, per_sample=True, runs=True),)
     marks = (KernelSpec("mark_near_cells", record_bytes=sample_bytes, per_sample=True, runs=True),)
     kernels = (
+        *(crowds if context.on("SPARSE") else ()),
         *(marks if walls else ()),
         KernelSpec(
             "store_cells",
@@ -169,7 +175,7 @@ def plan(context: Context) -> StageSpec | None:
         "cells",
         "light is shared by the paths that meet in a cell",
         "cells.cl",
-        flags=("AOV_CELLS", "BASE", "CELLS", "RESTORE", *TRACING),
+        flags=("AOV_CELLS", "BASE", "CELLS", "RESTORE", "SPARSE", *TRACING),
         kernels=kernels,
         buffers=buffers,
         traces=True,
