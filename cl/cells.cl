@@ -358,7 +358,7 @@ static inline void look_up_samples(
     }
 #if RESTORE
     const Vec3 lost = sub(own, light);
-    const float sign = pass_is_in_half(place->pass - params->first_pass) ? -1.0f : 1.0f;
+    const float sign = pass_is_in_half((place->pass - params->first_pass) / params->splits) ? -1.0f : 1.0f;
     const Float brightness = sign * luminance(lost);
     float lane_lost[4][W];
     store_lanes(lost.x, lane_lost[0]);
@@ -383,8 +383,13 @@ static inline void look_up_samples(
         // Of a sample that the film does not take nothing is known.
         if (before.w > 0.0f) {
             __global float *sums = (__global float *)&film_lost[first + i];
+            __global float *excess = (__global float *)&film_lost[params->pixel_count + first + i];
             const float4 all = (float4)(lane_lost[0][i], lane_lost[1][i], lane_lost[2][i], lane_lost[3][i]);
-            vstore4(vload4(0, sums) + all, 0, sums);
+            // Kahan (1965): what rounding added too much goes from the next sample.
+            const float4 added = all - vload4(0, excess);
+            const float4 sum = vload4(0, sums) + added;
+            vstore4((sum - vload4(0, sums)) - added, 0, excess);
+            vstore4(sum, 0, sums);
         }
 #endif
 #if AOV_CELLS

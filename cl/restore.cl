@@ -59,11 +59,13 @@ kernel void take_lost(
     const float weights[3] = {LUMINANCE_RED, LUMINANCE_GREEN, LUMINANCE_BLUE};
     for (uint c = 0; c < 3; ++c) {
         restored[4 * pixel + c] = (film[pixel].sum[c] - film[pixel].lost[c]) / count;
-        const float lost = fabs(tilt) < 1.0f ? film_lost[pixel].rgb[c] / count : 0.0f;
+        const float sum = film_lost[pixel].rgb[c] - film_lost[params->pixel_count + pixel].rgb[c];
+        const float lost = fabs(tilt) < 1.0f ? sum / count : 0.0f;
         unrestored[pixel].rgb[c] = lost;
         mean += weights[c] * lost;
     }
-    const float difference = film_lost[pixel].difference / count - tilt * mean;
+    const float apart = film_lost[pixel].difference - film_lost[params->pixel_count + pixel].difference;
+    const float difference = apart / count - tilt * mean;
     const float variance = difference * difference / max(1.0f - tilt * tilt, 1e-6f);
     unrestored[pixel].difference = variance * (1.0f + 4.0f / max(count - 1.0f, 1.0f));
 }

@@ -539,7 +539,7 @@ kernel void shade_paths(
     const Float to_come = luminance(mul(beta_here, b.base_color)) * guide.mean;
     const Float expected = pick(camera_ray, to_come, FIELD(path, PATH_EXPECTED));
     FIELD(path, PATH_EXPECTED) = expected;
-    chance = pick(roulette, informed_chance(to_come, expected, chance), chance);
+    chance = pick(roulette, min(informed_chance(to_come, expected, chance), (Float)(MAX_SURVIVAL)), chance);
 #endif
     survives &= left_of_choice(chances, u_lobe) < chance;
     beta = scale(beta, 1.0f / pick(survives, chance, (Float)(1.0f)));

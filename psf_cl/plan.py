@@ -262,6 +262,11 @@ def make_plan(
             f"--noise: samples of splits={settings.splits} begin alike, so that they cannot tell "
             "their error; expected splits=1, --spp or --seconds"
         )
+    if halves and restores(settings).value:
+        raise InputError(
+            "--noise: the error of what filter_restore puts back cannot be told from the samples; "
+            "expected filter_restore=false, --spp or --seconds"
+        )
     if settings.integrator == "metropolis":
         _check_metropolis(outputs, halves)
         traits = dataclasses.replace(traits, slots=metropolis.chain_count(settings, traits))
@@ -336,7 +341,7 @@ def make_plan(
         crop,
         context.ring,
         traits,
-        () if context.on("FEW") else _building(triangles),
+        () if context.on("FEW") else _building(context),
         levels,
     )
     lacking = plan.lacks(room) if room is not None else None
@@ -364,10 +369,22 @@ def _smaller(traits: DeviceTraits, halvings: int) -> DeviceTraits:
     return dataclasses.replace(traits, slots=slots - slots % traits.block)
 
 
-def _building(triangles: int) -> tuple[BufferSpec, ...]:
+def _building(context: Context) -> tuple[BufferSpec, ...]:
+    triangles = context.triangle_count
+    again = _tree(triangles) if context.on("MOTION") and not context.on("INSTANCES") else ()
     tree = BufferSpec("tree", layout.BINARY_NODE.dtype, 2 * triangles, "the tree while it is built")
     rest = max(BUILD_BYTES * triangles - tree.bytes, 0)
-    return tree, BufferSpec("boxes", np.dtype(np.uint8), rest, "what building the tree needs")
+    boxes = BufferSpec("boxes", np.dtype(np.uint8), rest, "what building the tree needs")
+    # A sequence builds its next tree beside the one before.
+    return tree, boxes, *again
+
+
+def _tree(triangles: int) -> tuple[BufferSpec, ...]:
+    block, node = layout.TRIANGLE_BLOCK.dtype, layout.BVH_NODE.dtype
+    return (
+        BufferSpec("blocks", block, -(-triangles // 2), "leaves (estimate)"),
+        BufferSpec("nodes", node, -(-triangles // 12), "inner nodes (estimate)"),
+    )
 
 
 def _mib(count: int) -> str:
@@ -543,7 +560,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
         "SPARSE": _sparse(settings),
         "WALLS": _walls(settings),
         "AOV_CELLS": _aov_cells(settings, outputs),
-        "RESTORE": _restore(settings),
+        "RESTORE": restores(settings),
         "SEEN": _seen(settings, outputs),
         "BASE": _base(settings, glossy),
         "METROPOLIS": switch(
@@ -571,8 +588,8 @@ def _motion(scene: Scene) -> Feature:
     return Feature(1, f"{moving.triangles} triangles move between frames")
 
 
-def _restore(settings: Settings) -> Feature:
-    """Return whether what averages per cell lost is added back."""
+def restores(settings: Settings) -> Feature:
+    """Return whether what averages per cell lost is added back to the picture."""
     if settings.path_filter == "off":
         return Feature(0, "path_filter is off")
     if settings.path_filter != "hash_grid":
@@ -754,11 +771,7 @@ def _scene_buffers(context: Context, scene: Scene) -> tuple[BufferSpec, ...]:
             BufferSpec("faces", np.dtype(np.uint32), 4 * triangles, "triangles between them"),
         ]
     else:
-        block, node = layout.TRIANGLE_BLOCK.dtype, layout.BVH_NODE.dtype
-        buffers += [
-            BufferSpec("blocks", block, -(-triangles // 2), "leaves (estimate)"),
-            BufferSpec("nodes", node, -(-triangles // 12), "inner nodes (estimate)"),
-        ]
+        buffers += _tree(triangles)
     if context.on("INSTANCES"):
         buffers.append(
             BufferSpec("instances", layout.INSTANCE.dtype, context.instance_count, "places")

@@ -33,7 +33,7 @@ from psf_cl.image import Image
 from psf_cl.instancing import Placed, place
 from psf_cl.measure.errors import error_of_halves
 from psf_cl.mover import Mover
-from psf_cl.plan import Plan, Room, make_plan
+from psf_cl.plan import Plan, Room, make_plan, restores
 from psf_cl.scene import animation
 from psf_cl.scene.digest import scene_digest
 from psf_cl.scene.far import far_from_origin, moved
@@ -132,7 +132,7 @@ class Renderer:
         self.refit: Refit | None = None
         self.light_tree: LightTree | None = None
         self.range_search: range_search.RangeSearch | None = None
-        self.rebuilds = 0
+        self.rebuilds = self.unbuilt = 0
         self.changed = False
         self.buffers: dict[str, Buffer] = {}
         try:
@@ -340,7 +340,11 @@ class Renderer:
         if self.refit.cost_ratio() <= REBUILD_RATIO:
             return
         old, size = self.bvh, self.bvh.stack_size
-        self._build_bvh(None)
+        try:
+            self._build_bvh(None)
+        except NoRoomError:
+            self.unbuilt += 1  # The tree that was fitted is as right, only slower.
+            return
         self.rebuilds += 1
         if self.bvh.stack_size > size:
             self.programs = self._compile(self.bvh.stack_size)
@@ -509,11 +513,12 @@ class Renderer:
         aovs["rgb"] = mean(main)
         if "film_direct" in sums:
             aovs["direct"] = mean(sums["film_direct"][0])
-            aovs["indirect"] = aovs["rgb"] - aovs["direct"]
-        if self._restores() and not partial:
+        if restores(self.settings).value and not partial:
             aovs["rgb"] = self._restored(counters)
         elif self.picture_launches and not partial:
             aovs["rgb"] = self._picture()
+        if "direct" in aovs:
+            aovs["indirect"] = aovs["rgb"] - aovs["direct"]
         if "film_features" in sums:
             aovs["albedo"], aovs["normal"], depth = (mean(plane) for plane in sums["film_features"])
             aovs["depth"] = depth[..., :1]
@@ -586,16 +591,10 @@ class Renderer:
             for name, field in cells.VIEWS.items()
         }
 
-    def _restores(self) -> bool:
-        """Return whether the image gets back what averages lost; not if that is only built in."""
-        wanted = self.settings.filter_restore and self.settings.path_filter == "hash_grid"
-        alone = self.settings.screen_filter == self.settings.temporal == "off"
-        return wanted and alone
-
     def _restored(self, counters: np.ndarray) -> np.ndarray:
         """Return the image with what averages per cell lost, ``(h, w, 3)``."""
         passes = int(counters[layout.COUNTER_INDEX["film_pass"]]) - self.scheduler.first
-        self.restore_launches[0][0].set(tilt=restore.tilt(passes))
+        self.restore_launches[0][0].set(tilt=restore.tilt(passes, self.settings.splits))
         for launch, items in self.restore_launches:
             launch(items, film.GROUP)
         return self._in_rows(self.device.read(self.buffers["restored"]).reshape(-1, 4)[:, :3])
@@ -726,6 +725,7 @@ class Renderer:
                 "blocks": self.bvh.block_count,
                 "depth": self.bvh.depth,
                 "rebuilds": self.rebuilds,
+                "rebuilds_without_room": self.unbuilt,
             },
             "settings": {
                 name: getattr(self.settings, name) for name in self.settings.__dataclass_fields__
@@ -753,8 +753,9 @@ class Renderer:
                     self._guide(False, start)
         left_out = self.guide_out is not None
         limit = 0 if left_out else guide.learn_limit(self._epoch(start), self.plan.pixel_count)
-        at = layout.COUNTER_INDEX["guide_off"]
-        self.device.write(self.buffers["counters"], np.array([left_out, limit], np.uint32), at)
+        for name, value in (("guide_off", left_out), ("learn_limit", limit)):
+            at = layout.COUNTER_INDEX[name]
+            self.device.write(self.buffers["counters"], np.array([value], np.uint32), at)
 
     def _guide(self, on: bool, start: int) -> None:
         """Go on with or without the guide from pass ``start`` on; no path may be on its way.

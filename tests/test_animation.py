@@ -13,7 +13,7 @@ from scene_builder import build, camera, floor, glowing, lambertian
 from test_gltf import Builder
 
 from psf_cl import tables
-from psf_cl.errors import InputError
+from psf_cl.errors import InputError, NoRoomError
 from psf_cl.plan import make_plan
 from psf_cl.renderer import Renderer
 from psf_cl.scene import primitives, transform
@@ -294,6 +294,21 @@ def test_frames_take_no_memory_and_trees_that_are_built_anew_give_back_the_old(d
     assert same.mean() > 0.8
     renderer.close()
     fresh.close()
+
+
+def test_frames_go_on_with_the_fitted_tree_where_another_has_no_room(device, monkeypatch):
+    def full(*_):
+        raise NoRoomError("no room for a tree")
+
+    renderer = frame_renderer(device, bending(with_tree=True))
+    monkeypatch.setattr("psf_cl.renderer.REBUILD_RATIO", 0.0)
+    monkeypatch.setattr("psf_cl.renderer.build_bvh", full)
+    renderer.set_frame(0.6)
+    image = means(renderer, 2)
+    renderer.close()
+    assert np.isfinite(image.rgb).all()
+    assert image.stats["bvh"]["rebuilds"] == 0
+    assert image.stats["bvh"]["rebuilds_without_room"] >= 1
 
 
 def test_frames_of_a_still_scene_add_up_to_one_long_render(device):

@@ -409,6 +409,22 @@ def test_a_refit_without_moves_gives_the_same_bits(traced, count):
     assert (tree.nodes.tobytes(), tree.blocks.tobytes()) == (nodes, blocks)
 
 
+@pytest.mark.parametrize("finite", [True, False], ids=["still", "nothing in the tree"])
+def test_a_refit_of_nothing_that_moves_leaves_the_tree(device, finite):
+    corners = np.random.default_rng(5).random((300, 3, 3)).astype(np.float32)
+    if not finite:
+        corners[:, 0, 0] = np.nan
+    positions = device.upload("positions", corners)
+    bvh = build_bvh(device, positions, 300)
+    before = device.read(bvh.nodes).tobytes(), device.read(bvh.blocks).tobytes()
+    refit = Refit(device, bvh, 300)
+    refit.fit(positions)
+    assert refit.cost_ratio() == 1.0
+    assert before == (device.read(bvh.nodes).tobytes(), device.read(bvh.blocks).tobytes())
+    refit.release()
+    device.release(positions, bvh.nodes, bvh.blocks)
+
+
 def test_hits_after_a_refit_equal_brute_force(traced):
     tree = traced(soup(1000), alpha=np.arange(1000) % 3 == 0)
     links = tree.nodes["child"].copy(), tree.blocks["id"].copy()

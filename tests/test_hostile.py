@@ -355,6 +355,14 @@ def test_a_name_with_a_line_break_is_still_one_line(folder, capfd):
     assert "a b.toml" in refused(["render", "a\nb.toml", *RUN.split()], capfd, folder)
 
 
+@pytest.mark.parametrize("command", ["render", "plan"])
+def test_a_clip_of_one_image_is_refused(folder, capfd, command):
+    (folder / "a.glb").write_bytes(glb(triangle_gltf()))
+    assert "--clip: expected --frames" in refused(
+        [command, "a.glb", "--clip", "walk"], capfd, folder
+    )
+
+
 def assert_render_is_quiet(capfd, scene: str, note: str) -> None:
     assert main(["render", scene, *RUN.split()]) == 0
     told = capfd.readouterr().err

@@ -10,6 +10,7 @@ from scene_builder import LUMINANCE, render, renderer
 from test_cells import FILTER, room
 
 from psf_cl.device.device import open_device
+from psf_cl.errors import InputError
 from psf_cl.plan import make_plan
 from psf_cl.settings import Settings, preset_values
 from psf_cl.stages.restore import RADII
@@ -34,6 +35,7 @@ def model(opened):
     """Return the picture that the film and what it lost make."""
     width, height = SIZE
     film, lost = (opened.device.read(opened.buffers[name]) for name in ("film", "film_lost"))
+    lost, excess = np.split(lost, 2)
 
     def picture(values):
         image = np.zeros((width * height, values.shape[-1]))
@@ -42,12 +44,13 @@ def model(opened):
 
     count = film["count"].astype(np.float64)[:, None]
     image = picture((film["sum"] - film["lost"]) / count)
-    mean = lost["rgb"] / count
+    mean = (lost["rgb"].astype(np.float64) - excess["rgb"]) / count
     # Runs of about sqrt(pass) passes take turns between the halves.
     passes = np.arange(int(count[0, 0]))
     runs = 2 ** (np.floor(np.log2(np.maximum(passes, 1))).astype(int) // 2)
     first = 1 - 2 * (passes // runs % 2).mean()
-    difference = lost["difference"][:, None] / count - first * (mean @ LUMINANCE)[:, None]
+    apart = lost["difference"].astype(np.float64) - excess["difference"]
+    difference = apart[:, None] / count - first * (mean @ LUMINANCE)[:, None]
     left, variance = picture(mean), picture(difference**2 / (1 - first**2) * (1 + 4 / (count - 1)))
     for radius in RADII:
         sums, counts = windows(np.concatenate([left, variance], axis=-1), radius)
@@ -87,6 +90,37 @@ def test_the_picture_equals_a_model_in_numpy(lane_device):
     averages[opened.order] = film["sum"] / film["count"][:, None]
     assert error(expected, averages.reshape(image.shape)) > 1e-6
     np.testing.assert_allclose(image, expected, rtol=1e-3, atol=1e-4)
+
+
+def test_what_was_lost_is_summed_as_exactly_as_the_film(device):
+    """The averages and what they lost are the samples: those of path tracing, to the last sum."""
+    opened = renderer(device, room(SIZE), **RESTORE, cell_size=16.0)
+    opened.render(spp=64)
+    film, lost = (opened.device.read(opened.buffers[name]) for name in ("film", "film_lost"))
+    opened.close()
+    plain = renderer(device, room(SIZE))
+    plain.render(spp=64)
+    truth = plain.device.read(plain.buffers["film"])
+    plain.close()
+    lost, excess = np.split(lost, 2)
+    assert excess["rgb"].any()
+    both = (film["sum"] - film["lost"] + lost["rgb"] - excess["rgb"].astype(np.float64)) / 64
+    expected = (truth["sum"] - truth["lost"].astype(np.float64)) / 64
+    np.testing.assert_allclose(both, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_light_reflected_more_than_once_is_the_rest_of_the_restored_picture(device):
+    opened = renderer(device, room(SIZE), ("direct", "indirect"), **RESTORE, cell_size=16.0)
+    opened.render(spp=8)
+    image = opened.image()
+    opened.close()
+    rest = image.rgb - image.aovs["direct"]
+    np.testing.assert_array_equal(image.aovs["indirect"], rest)
+
+
+def test_no_error_is_estimated_of_what_goes_back():
+    with pytest.raises(InputError, match="--noise: the error of what filter_restore"):
+        make_plan(room(), Settings(**RESTORE), halves=True)
 
 
 def test_with_ever_more_samples_nothing_of_the_blur_is_left(device):

@@ -214,6 +214,8 @@ def load_with_settings(args: argparse.Namespace) -> tuple[Scene, Settings]:
     """
     from psf_cl.scene.load import load_scene
 
+    if getattr(args, "clip", None) and not args.frames:
+        raise InputError("--clip: expected --frames A:B with it: in one image nothing moves")
     # Only a sequence reads what moves.
     motion = {"moving": True, "clip": args.clip} if getattr(args, "frames", None) else {}
     scene = load_scene(

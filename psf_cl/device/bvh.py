@@ -168,7 +168,7 @@ class Refit:
         levels.pop()
         if first_moving > 0:
             levels = self._moving_levels(nodes["child"], levels, first_moving)
-        self.places = device.upload("places", np.concatenate(levels))
+        self.places = device.upload("places", np.concatenate(levels or [np.zeros(1, np.uint32)]))
         self.areas = device.allocate("areas", np.float32, bvh.node_count)
         self.levels = _level_ranges([len(level) for level in levels])
         self.program = _load(device, bvh.width)
@@ -182,6 +182,8 @@ class Refit:
         used = ids != CONSTANT["NO_HIT"]
         moves = ids & ~np.uint32(CONSTANT["ALPHA_BIT"]) >= first_moving
         moving_blocks = (used & moves).any(axis=1)
+        if not moving_blocks.any():
+            return []
         leaf = np.uint32(CONSTANT["LEAF_BIT"])
         moving = np.zeros(len(children), bool)
         for level in reversed(levels):
@@ -242,6 +244,8 @@ def _fit(
         levels: where in ``places`` each level starts, and how many nodes it has.
     """
     count = sum(size for _, size in levels)
+    if not count:
+        return
     program.bind(
         "fit_blocks",
         positions=positions,

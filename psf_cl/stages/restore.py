@@ -11,14 +11,15 @@ from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
 RADII = (8, 2)
 
 
-def tilt(passes: int) -> float:
+def tilt(passes: int, splits: int = 1) -> float:
     """Return how much more of so many passes the first half has than the second, of 1 in all.
 
-    The halves are those of ``pass_is_in_half`` (``cl/common/passes.h``).
+    The halves are those of ``pass_is_in_half`` (``cl/common/passes.h``) of as many ``splits``, for
+    these begin alike.
     """
     if passes < 1:
         return 1.0
-    numbers = np.arange(passes, dtype=np.int64)
+    numbers = np.arange(passes, dtype=np.int64) // splits
     run = np.frexp(np.maximum(numbers, 1))[1] - 1 >> 1
     return float(1.0 - 2.0 * ((numbers >> run) & 1).mean())
 
@@ -39,7 +40,9 @@ def plan(context: Context) -> StageSpec | None:
             KernelSpec("restore_pixels"),
         ),
         buffers=(
-            BufferSpec("film_lost", lost, pixels, "sums of what averages took from the pixels"),
+            BufferSpec(
+                "film_lost", lost, 2 * pixels, "what averages took from the pixels, and excess"
+            ),
             BufferSpec("unrestored", lost, pixels, "of that, what is not put back yet", True),
             BufferSpec("rows", lost, pixels, "the same, summed over rows", True),
             BufferSpec("restored", np.dtype(np.float32), 4 * pixels, "the picture with it", True),
