@@ -10,6 +10,8 @@ The file is written after every render, from the second on: an interrupted comma
 goes on; so does a finished one with more ``--seeds`` or less ``--noise``.  At the end the halves
 are compared with what the stated variance allows.
 
+With ``--frames A:B`` there is one of each frame; #### in REF.exr is its number.
+
 ``psf-cl converge``, ``psf-cl render --reference`` and ``psf-cl compare`` read REF.exr.
 """
 
@@ -26,19 +28,24 @@ from typing import Any
 
 import psf_cl
 from psf_cl.cli.common import (
+    add_frame_arguments,
     add_scene_arguments,
     load_with_settings,
+    numbered,
     positive_integer,
     positive_number,
     tell_notes,
 )
-from psf_cl.device.device import open_device
+from psf_cl.device.device import Device, open_device
 from psf_cl.errors import DeviceError, InputError
 from psf_cl.files import check_writable, write_whole
 from psf_cl.image import Image, json_text, output_paths, read_exr, write_exr, write_png
 from psf_cl.measure.curves import Reference
 from psf_cl.measure.references import RunningReference
 from psf_cl.scene.digest import scene_digest
+from psf_cl.scene.load import load_scene
+from psf_cl.scene.model import Scene
+from psf_cl.settings import Settings
 
 # Fewer renders say too little of their own variance to stop by it.
 LEAST_SEEDS = 8
@@ -57,6 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add_scene_arguments(parser)
     # After that call, which makes the settings the epilog.
     parser.description = __doc__
+    add_frame_arguments(parser)
     parser.add_argument("-o", "--output", metavar="REF.exr", required=True)
     parser.add_argument(
         "--spp",
@@ -79,14 +87,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if args.crop or args.aov:
         parser.error("--crop, --aov: a reference is the whole picture and nothing else")
 
+    if not args.frames:
+        scene, settings = load_with_settings(args)
+        return make(args, scene, settings, open_device(args.device), args.output)
+    _, settings = load_with_settings(args)
+    device = open_device(args.device)
+    failed = 0
+    for frame in args.frames:
+        scene = load_scene(
+            args.scene,
+            environment=args.environment,
+            camera=args.camera,
+            size=args.size,
+            clip=args.clip,
+            time=frame / args.fps,
+        )
+        failed |= make(args, scene, settings, device, numbered(args.output, frame, "-o"))
+    return failed
+
+
+def make(
+    args: argparse.Namespace, scene: Scene, settings: Settings, device: Device, output: str
+) -> int:
+    """Render one reference, and write it; return 1 if its halves disagree."""
     spp = args.spp or (SPP_TOWARDS_NOISE if args.noise else SPP)
-    exr, png = output_paths(args.output)
+    exr, png = output_paths(output)
     record = exr.with_suffix(".json")
     for path in (exr, png, record):
         check_writable(path)
-    scene, settings = load_with_settings(args)
     tell_notes(scene.notes)
-    device = open_device(args.device)
     made = {
         "scene": scene.path,
         "scene_digest": scene_digest(scene),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import re
 import sys
 import time
 from collections.abc import Iterable
@@ -72,6 +73,22 @@ def frames_argument(text: str) -> range:
             f"expected A:B, frames A to B - 1, at most {MAX_FRAMES}; got {text!r}"
         )
     return range(*numbers)
+
+
+def numbered(name: str, frame: int, option: str) -> str:
+    """Return a name of files with the number of a frame in place of its run of #.
+
+    Raises:
+        InputError: it has none, or several; ``option`` is what gave it.
+    """
+    folder, last = os.path.split(name)
+    marks = re.findall("#+", last)
+    if len(marks) != 1:
+        raise InputError(
+            f"{option}: expected one run of # in the name, for the frame; got {name!r}"
+        )
+    number = str(frame).zfill(len(marks[0]))
+    return os.path.join(folder, last.replace(marks[0], number))
 
 
 def file_argument(text: str) -> str:

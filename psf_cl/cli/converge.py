@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from psf_cl.cli.common import (
     START,
+    add_frame_arguments,
     add_picture_arguments,
     file_argument,
     positive_integer,
@@ -41,12 +42,21 @@ def add_parser(commands: Any) -> None:
         "converge", help="error against run time of several presets or renderers, as a report"
     )
     add_picture_arguments(parser)
+    add_frame_arguments(parser)
+    parser.add_argument(
+        "--change",
+        metavar="N",
+        type=int,
+        help="with --frames: the frame from which a fresh start is the measure of lag (default: "
+        "the one whose reference differs most from the one before)",
+    )
     parser.add_argument(
         "--reference",
         metavar="REF.exr",
         type=file_argument,
         required=True,
-        help="the truth, as tools/make_references.py makes it; --size is its size by default",
+        help="the truth, as tools/make_references.py makes it; --size is its size by default; with "
+        "--frames, #### in it is the frame's number, or it is a folder of 0000.exr, 0001.exr, ...",
     )
     parser.add_argument(
         "--presets",
@@ -132,6 +142,12 @@ def run(args: argparse.Namespace) -> int:
     from psf_cl.measure.curves import reference_of
     from psf_cl.measure.report import Entry, Study, write_report
 
+    if args.frames:
+        from psf_cl.cli import sequence_study
+        from psf_cl.scene.load import load_scene
+
+        contestants = _contestants(args, load_scene(args.scene))
+        return sequence_study.run(args, contestants, _output_folder(args))
     image = read_exr(args.reference)
     reference = reference_of(image, args.reference)
     folder = _output_folder(args)

@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import math
 import os
-import re
 import signal
 import sys
 import threading
@@ -25,6 +24,7 @@ from psf_cl.cli.common import (
     file_argument,
     first_time,
     load_with_settings,
+    numbered,
     positive_integer,
     positive_number,
     room_of,
@@ -202,11 +202,7 @@ def _frame_name(args: argparse.Namespace, frame: int) -> str:
     name = args.output or default
     if args.frames is None:
         return name
-    marks = re.findall("#+", Path(name).name)
-    if len(marks) != 1:
-        raise InputError(f"-o: expected one run of # in the name, for the frame; got {name!r}")
-    number = str(frame).zfill(len(marks[0]))
-    return str(Path(name).with_name(Path(name).name.replace(marks[0], number)))
+    return numbered(name, frame, "-o")
 
 
 def _render_frame(
