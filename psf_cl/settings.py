@@ -66,12 +66,14 @@ class Settings:
         0.3, 0.01, 1.0, doc="share of the paths of metropolis that are independent of their chain"
     )
     light_sampling: str = _choice(
+        "auto",
         "power",
         "uniform",
         "hierarchy",
         "photon",
         doc="how next event estimation picks an emitter; hierarchy: a tree of lights asks for what "
-        "each might bring to a surface; photon: photons tell which of them see it",
+        "each might bring to a surface; photon: photons tell which of them see it; auto: photon "
+        "where there are many, else power",
     )
     photons: int = _number(
         0,

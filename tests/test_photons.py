@@ -1,6 +1,7 @@
 """Photons: what becomes of them, and images that do not depend on them."""
 
 import numpy as np
+import planes
 import pytest
 from scene_builder import build, camera, floor, glowing, inside_out, lambertian, render, z_scores
 from scene_builder import renderer as open_renderer
@@ -8,7 +9,7 @@ from scipy import stats
 from test_light_tree import many_kinds
 
 from psf_cl.device import layout
-from psf_cl.plan import make_plan
+from psf_cl.plan import MANY_LIGHTS, make_plan
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.model import Light
 from psf_cl.settings import Settings
@@ -103,6 +104,55 @@ def test_light_that_no_photon_saw_is_still_found(device):
     z = z_scores(guided, table, 4)
     assert np.abs(z).max() < 4.0
     assert stats.chi2.sf((z**2).sum(), z.size) > 1e-4
+
+
+def test_chances_of_all_lights_sum_to_one_in_a_thousand_cells(device):
+    """And lights are drawn with the chances that a ray that finds them by chance is told of."""
+    opened = open_renderer(device, many_kinds(), light_sampling="photon", photons=3000)
+    opened.render(spp=1)
+    lights = len(opened.lights)
+    rng = np.random.default_rng(11)
+    normal = rng.normal(size=(3, 1000))
+    normal[:, :700] = np.array([[0.0], [1.0], [0.0]])
+    normal /= np.linalg.norm(normal, axis=0)
+    points = np.concatenate([rng.uniform(-2, 2, (3, 1000)), normal]).astype(np.float32)
+    points[1, :700] = 1e-4  # On the floor, where photons are.
+    names = ("params", "lights", "light_pairs", "light_places", "light_groups", "particle_table")
+    given = {name: opened.buffers[name] for name in names}
+    defines = {name: feature.value for name, feature in opened.plan.features.items()}
+
+    def run(kernel, inputs, outputs):
+        file = "light_choice_test.cl"
+        return planes.run(device, file, kernel, inputs, outputs, defines, **given)
+
+    inputs = {
+        "points": np.repeat(points, lights, axis=1),
+        "light": np.tile(np.arange(lights, dtype=np.uint32), 1000),
+    }
+    outputs = {"chances": (np.float32, 1), "known": (np.uint32, 1)}
+    chances, known = run("list_chances", inputs, outputs)
+    chances = chances.reshape(1000, lights).astype(np.float64)
+    assert 300 < known.reshape(1000, lights)[:, 0].sum() < 1000
+    np.testing.assert_allclose(chances.sum(axis=1), 1.0, atol=2e-5)
+    bits = rng.integers(0, 1 << 32, 1000, dtype=np.uint32)
+    outputs = {"drawn": (np.uint32, 1), "chances": (np.float32, 1)}
+    drawn, chance = run("draw_lights", {"points": points, "bits": bits}, outputs)
+    np.testing.assert_allclose(chance, chances[np.arange(1000), drawn], rtol=2e-5)
+    opened.close()
+
+
+def test_many_lights_have_photons_unless_something_else_is_asked_for():
+    def lit_by(count):
+        lights = [Light("point", (1.0, 1.0, 1.0), position=(0, 1, 0.01 * k)) for k in range(count)]
+        return build([floor(1.0, lambertian(0.5))], camera((0, 1, 3), (0, 0, 0)), lights=lights)
+
+    def sampling(count, **values):
+        return make_plan(lit_by(count), Settings(**values)).features["LIGHT_SAMPLING"].value
+
+    assert sampling(2) == sampling(MANY_LIGHTS - 1) == 0
+    assert sampling(MANY_LIGHTS) == 2
+    assert sampling(MANY_LIGHTS, integrator="metropolis") == 1
+    assert sampling(MANY_LIGHTS, light_sampling="power") == 0
 
 
 def test_one_light_needs_no_photons():
