@@ -66,7 +66,7 @@ BUILD_BYTES = 240
 
 #: Lights (emitting triangles are one each) from which on ``light_sampling=auto`` asks photons.
 #: At equal times, against a table: with 12,050 (``many_lights``) a quarter of the error; with 1,201
-#: (a map of a game, 64 x 40, 16 spp) 1.7 times as much; other scenes here have at most 12.
+#: (a map of a game, 64 x 40) 1.7 times as much at 16 spp; other scenes here have at most 12.
 MANY_LIGHTS = 4096
 
 #: The least of a pool, and how often it is halved on the way there.
