@@ -53,6 +53,12 @@ SHARED_SAMPLES = (1, 2, 4, 8, 16)
 SEEDS = 4
 TIMED_SAMPLES = 32
 
+# Of each series, what is on its axes.
+AXES = {
+    "vertices": ("vertices of the pass", "processor seconds to filter it"),
+    "splitting": ("processor nanoseconds a pixel", "relMSE"),
+}
+
 # (x, y) of each point of a named curve; what a curve has not come to is None.
 Curves = dict[str, list[tuple[float, float | None]]]
 
@@ -183,26 +189,24 @@ def measure_splitting(side: int, rounds: int, reference_spp: int) -> Curves:
     }
 
 
-def print_curves(console: Console, title: str, head: str, curves: Curves, text: str) -> None:
-    """Print a table of each curve."""
+def print_curves(console: Console, key: str, curves: Curves) -> None:
+    """Print a table of each curve of a series."""
     for name, points in curves.items():
-        table = Table(title=f"{title}: {name}", title_justify="left")
-        for column in (head, text):
+        table = Table(title=f"{key}: {name}", title_justify="left")
+        for column in AXES[key]:
             table.add_column(column, justify="right")
         for x, y in points:
             table.add_row(f"{x:.0f}", "stopped" if y is None else f"{y:.4g}")
         console.print(table)
 
 
-def figure_of(vertices: Curves, stop: float, splitting: Curves) -> plot.Drawing:
-    """Draw both series side by side; where range search was stopped its mark is grey."""
-    names = [*vertices, *splitting]
+def figure_of(measured: dict[str, Curves], stop: float) -> plot.Drawing:
+    """Draw the series side by side; where range search was stopped its mark is grey."""
+    names = [name for curves in measured.values() for name in curves]
     looks = dict(zip(names, zip(plot.COLOURS, itertools.cycle(plot.SHAPES)), strict=False))
     panels = []
-    for title, x_label, curves in (
-        ("processor seconds to filter a pass", "vertices of the pass", vertices),
-        ("relMSE", "processor nanoseconds a pixel", splitting),
-    ):
+    for key, curves in measured.items():
+        x_label, title = AXES[key]
         series = []
         for name, points in curves.items():
             # What comes after the first point that was stopped was not tried.
@@ -220,6 +224,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("series", nargs="*", metavar="SERIES", help=", ".join(AXES))
     parser.add_argument("--rounds", type=positive_integer, default=5)
     parser.add_argument("--stop", type=positive_number, default=120.0, help="range search at (120)")
     parser.add_argument("--most", type=positive_integer, default=VERTICES[-1], help="vertices")
@@ -227,13 +232,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--reference-spp", type=positive_integer, default=2048, metavar="SPP")
     parser.add_argument("--plot", type=Path, metavar="FILE.svg")
     args = parser.parse_args(arguments)
-    console = Console()
-    splitting = measure_splitting(args.side, args.rounds, args.reference_spp)
-    print_curves(console, "splitting", "ns a pixel", splitting, "relMSE")
-    vertices = measure_vertices(max(args.most, VERTICES[0]), args.rounds, args.stop)
-    print_curves(console, "vertices", "vertices", vertices, "seconds")
+    for name in args.series:
+        if name not in AXES:
+            parser.error(f"{name}: expected {', '.join(AXES)}")
+    measures = {
+        "vertices": lambda: measure_vertices(args.most, args.rounds, args.stop),
+        "splitting": lambda: measure_splitting(args.side, args.rounds, args.reference_spp),
+    }
+    measured = {key: measures[key]() for key in args.series or AXES}
+    for key, curves in measured.items():
+        print_curves(Console(), key, curves)
     if args.plot is not None:
-        figure = figure_of(vertices, args.stop, splitting)
+        figure = figure_of(measured, args.stop)
         if args.plot.suffix == ".svg":
             args.plot.write_text(figure.svg(), encoding="utf-8")
         else:
