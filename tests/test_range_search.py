@@ -156,7 +156,8 @@ def bias_of(device, scene, spp, seeds, part, **settings):
     found = {}
     plain = [render(device, scene, spp, seed=seed).rgb for seed in range(seeds)]
     for name in ("hash_grid", "range_search"):
-        values = {**SEARCH, "path_filter": name, "cell_shrink": False, **settings}
+        values = {**SEARCH, "path_filter": name, "cell_shrink": False, "cell_walls": False}
+        values |= settings
         # Of the same seeds: much of the noise of both images is the same.
         images = [
             (render(device, scene, spp, seed=seed, **values).rgb - plain[seed])[part]
