@@ -529,10 +529,13 @@ kernel void shade_paths(
     const Mask roulette = (depth + 1u) > params->roulette_depth;
     Float worth = max3(beta);
 #if TRANSMISSION
-    // Inside of glass beta is smaller by eta^2 and will be larger again: that is no reason to end.
-    const Mask within = (b.transmission > 0.0f) & !b.thin
-                        & (((drawn.z < 0.0f) & (b.eta > 1.0f)) | ((drawn.z > 0.0f) & (b.eta < 1.0f)));
-    worth *= pick(within, max(b.eta * b.eta, 1.0f / (b.eta * b.eta)), (Float)(1.0f));
+    // Inside of glass beta is smaller by eta^2 and will be larger again, in glass within glass more than once: that
+    // is no reason to end.
+    const Mask crosses = (drawn.z < 0.0f) & (b.transmission > 0.0f) & !b.thin;
+    Float denser = pick(camera_ray, (Float)(1.0f), FIELD(path, PATH_DENSER));
+    denser *= pick(crosses, b.eta * b.eta, (Float)(1.0f));
+    FIELD(path, PATH_DENSER) = denser;
+    worth *= denser;
 #endif
     Float chance = pick(roulette, min(worth, (Float)(MAX_SURVIVAL)), (Float)(1.0f));
 #if GUIDE

@@ -131,13 +131,13 @@ def test_roulette_adds_little_noise_to_paths_of_a_thousand_bounces(device, albed
     np.testing.assert_allclose(image.rgb.mean(), 1.0, rtol=0.05)
 
 
-def test_roulette_does_not_take_the_step_into_glass_for_a_loss(device):
-    """Inside of glass of index 5 a path carries a 25th, until it leaves."""
+@pytest.mark.parametrize("ior,radii", [(5.0, (1.0,)), (1.5, (1.0, 0.7, 0.4))])
+def test_roulette_does_not_take_the_step_into_glass_for_a_loss(device, ior, radii):
+    """Inside of glass of index 5 a path carries a 25th until it leaves, of three of 1.5 an 11th."""
     ball = dataclasses.replace(primitives.sphere(24, 12), normals=None)
-    glass = Material(base_color=(1.0, 1.0, 1.0), transmission=1.0, ior=5.0, roughness=0.0)
-    scene = build(
-        [(ball, np.eye(4), glass)], camera((0, 0.3, 3), (0, 0, 0), 45), (16, 16), environment=1.0
-    )
+    glass = Material(base_color=(1.0, 1.0, 1.0), transmission=1.0, ior=ior, roughness=0.0)
+    balls = [(ball, transform.scaling(radius), glass) for radius in radii]
+    scene = build(balls, camera((0, 0.3, 3), (0, 0, 0), 45), (16, 16), environment=1.0)
     with_roulette = render(device, scene, 32, ["variance"], max_depth=64, sampler="random")
     without = render(
         device, scene, 32, ["variance"], max_depth=64, sampler="random", termination="off"

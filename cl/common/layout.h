@@ -104,68 +104,74 @@
 #define PATH_LIGHT_R 30u // radiance that arrives if nothing is in between, times beta; all 0: no ray
 #define PATH_LIGHT_G 31u
 #define PATH_LIGHT_B 32u
-#if LIGHT_SAMPLING >= 1
-#define PATH_LIGHT_NORMAL (33u + 0u) // uint; packed: what the last light was chosen for, besides the origin
+#if TRANSMISSION >= 1
+#define PATH_DENSER (33u + 0u) // by what glass around it makes beta smaller: its indices squared, multiplied
 #define PATH_END_1 (33u + 1u)
 #else
 #define PATH_END_1 33u
 #endif
-#if LIGHT_SAMPLING >= 2
-#define PATH_PARTICLE_ROW (PATH_END_1 + 0u) // uint; row of the table of photons that it was chosen by
+#if LIGHT_SAMPLING >= 1
+#define PATH_LIGHT_NORMAL (PATH_END_1 + 0u) // uint; packed: what the last light was chosen for, besides the origin
 #define PATH_END_2 (PATH_END_1 + 1u)
 #else
 #define PATH_END_2 PATH_END_1
 #endif
-#if BASE >= 1
-#define PATH_BASE_R (PATH_END_2 + 0u) // of what goes to the pixel, what the base of the first surface reflected
-#define PATH_BASE_G (PATH_END_2 + 1u)
-#define PATH_BASE_B (PATH_END_2 + 2u)
-#define PATH_END_3 (PATH_END_2 + 3u)
+#if LIGHT_SAMPLING >= 2
+#define PATH_PARTICLE_ROW (PATH_END_2 + 0u) // uint; row of the table of photons that it was chosen by
+#define PATH_END_3 (PATH_END_2 + 1u)
 #else
 #define PATH_END_3 PATH_END_2
 #endif
-#if BASE >= 2
-#define PATH_BASE_SHARE_R (PATH_END_3 + 0u) // part of what comes from beyond that surface that its base reflects
-#define PATH_BASE_SHARE_G (PATH_END_3 + 1u)
-#define PATH_BASE_SHARE_B (PATH_END_3 + 2u)
-#define PATH_BASE_LIGHT_R (PATH_END_3 + 3u) // the same of the shadow ray
-#define PATH_BASE_LIGHT_G (PATH_END_3 + 4u)
-#define PATH_BASE_LIGHT_B (PATH_END_3 + 5u)
-#define PATH_END_4 (PATH_END_3 + 6u)
+#if BASE >= 1
+#define PATH_BASE_R (PATH_END_3 + 0u) // of what goes to the pixel, what the base of the first surface reflected
+#define PATH_BASE_G (PATH_END_3 + 1u)
+#define PATH_BASE_B (PATH_END_3 + 2u)
+#define PATH_END_4 (PATH_END_3 + 3u)
 #else
 #define PATH_END_4 PATH_END_3
 #endif
-#if CELLS >= 1
-#define PATH_VERTEX (PATH_END_4 + 0u) // uint; 1 + depth of the vertex behind which light is shared, VERTEX_NEAR; 0: none
-#define PATH_LENGTH (PATH_END_4 + 1u) // m, from the camera on
-#define PATH_BEYOND_R (PATH_END_4 + 2u) // of what was gathered, what is shared: it came from beyond that vertex
-#define PATH_BEYOND_G (PATH_END_4 + 3u)
-#define PATH_BEYOND_B (PATH_END_4 + 4u)
-#define PATH_END_5 (PATH_END_4 + 5u)
+#if BASE >= 2
+#define PATH_BASE_SHARE_R (PATH_END_4 + 0u) // part of what comes from beyond that surface that its base reflects
+#define PATH_BASE_SHARE_G (PATH_END_4 + 1u)
+#define PATH_BASE_SHARE_B (PATH_END_4 + 2u)
+#define PATH_BASE_LIGHT_R (PATH_END_4 + 3u) // the same of the shadow ray
+#define PATH_BASE_LIGHT_G (PATH_END_4 + 4u)
+#define PATH_BASE_LIGHT_B (PATH_END_4 + 5u)
+#define PATH_END_5 (PATH_END_4 + 6u)
 #else
 #define PATH_END_5 PATH_END_4
 #endif
-#if CELLS >= 2
-#define PATH_SHARE_R (PATH_END_5 + 0u) // part of what comes from beyond the vertex that its diffuse base reflects
-#define PATH_SHARE_G (PATH_END_5 + 1u)
-#define PATH_SHARE_B (PATH_END_5 + 2u)
-#define PATH_LIGHT_SHARE_R (PATH_END_5 + 3u) // the same of the shadow ray
-#define PATH_LIGHT_SHARE_G (PATH_END_5 + 4u)
-#define PATH_LIGHT_SHARE_B (PATH_END_5 + 5u)
-#define PATH_END_6 (PATH_END_5 + 6u)
+#if CELLS >= 1
+#define PATH_VERTEX (PATH_END_5 + 0u) // uint; 1 + depth of the vertex behind which light is shared, VERTEX_NEAR; 0: none
+#define PATH_LENGTH (PATH_END_5 + 1u) // m, from the camera on
+#define PATH_BEYOND_R (PATH_END_5 + 2u) // of what was gathered, what is shared: it came from beyond that vertex
+#define PATH_BEYOND_G (PATH_END_5 + 3u)
+#define PATH_BEYOND_B (PATH_END_5 + 4u)
+#define PATH_END_6 (PATH_END_5 + 5u)
 #else
 #define PATH_END_6 PATH_END_5
 #endif
-#if GUIDE >= 1
-#define PATH_GUIDE (PATH_END_6 + 0u) // uint; part of the guide's cell that the ray left through; NO_PART: none
-#define PATH_GUIDE_FROM (PATH_END_6 + 1u) // uint; that of the ray before the shadow ray
-#define PATH_EXPECTED (PATH_END_6 + 2u) // luminance at the camera that the first vertex was expected to reflect
-#define PATH_GUIDE_LIGHT (PATH_END_6 + 3u) // luminance that arrives through the shadow ray, reflected along that
-#define PATH_END_7 (PATH_END_6 + 4u)
+#if CELLS >= 2
+#define PATH_SHARE_R (PATH_END_6 + 0u) // part of what comes from beyond the vertex that its diffuse base reflects
+#define PATH_SHARE_G (PATH_END_6 + 1u)
+#define PATH_SHARE_B (PATH_END_6 + 2u)
+#define PATH_LIGHT_SHARE_R (PATH_END_6 + 3u) // the same of the shadow ray
+#define PATH_LIGHT_SHARE_G (PATH_END_6 + 4u)
+#define PATH_LIGHT_SHARE_B (PATH_END_6 + 5u)
+#define PATH_END_7 (PATH_END_6 + 6u)
 #else
 #define PATH_END_7 PATH_END_6
 #endif
-#define PATH_FIELD_COUNT PATH_END_7
+#if GUIDE >= 1
+#define PATH_GUIDE (PATH_END_7 + 0u) // uint; part of the guide's cell that the ray left through; NO_PART: none
+#define PATH_GUIDE_FROM (PATH_END_7 + 1u) // uint; that of the ray before the shadow ray
+#define PATH_EXPECTED (PATH_END_7 + 2u) // luminance at the camera that the first vertex was expected to reflect
+#define PATH_GUIDE_LIGHT (PATH_END_7 + 3u) // luminance that arrives through the shadow ray, reflected along that
+#define PATH_END_8 (PATH_END_7 + 4u)
+#else
+#define PATH_END_8 PATH_END_7
+#endif
+#define PATH_FIELD_COUNT PATH_END_8
 
 #define CHAIN_KNOWN 0u // uint; pairs of numbers of the state from which the path starts; 0: a large step
 #define CHAIN_PAIRS 1u // uint; pairs of numbers that the state has

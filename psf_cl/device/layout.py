@@ -694,6 +694,16 @@ PATH_FIELDS = (
 #: Words that only paths of some features have: (feature, least value of it, words).
 OPTIONAL_PATH_FIELDS = (
     (
+        "TRANSMISSION",
+        1,
+        (
+            (
+                "denser",
+                "by what glass around it makes beta smaller: its indices squared, multiplied",
+            ),
+        ),
+    ),
+    (
         "LIGHT_SAMPLING",
         1,
         (("light_normal", "uint; packed: what the last light was chosen for, besides the origin"),),

@@ -74,6 +74,7 @@ def _kernel(context: Context) -> KernelSpec:
         shadow += ("guide_from", "guide_light")
     walk = ("status", "direction", "beta", "radiance", "pdf")
     walk += (*direct, *base, *shared, *chosen, *guided)
+    walk += ("denser",) if context.on("TRANSMISSION") else ()
     records = [layout.SURFACE, layout.MATERIAL]
     if context.on("INSTANCES"):
         records.append(layout.INSTANCE)
