@@ -356,8 +356,9 @@ kernel void shade_paths(
     const UInt noise = mix_bits(mix_bits(get_u(path, PATH_SEED) + depth * 0x9e3779b9u) + sample);
     const Mask learning = alive & (sample < counters[COUNTER_LEARN_LIMIT]);
     const Mask guided = goes_on & !delta & (Mask)(counters[COUNTER_GUIDE_OFF] ? 0 : -1);
-    const Guide guide =
+    Guide guide =
         find_guide(params, guide_keys, guide_cells, guide_full, counters, guided, learning, s.p, s.ns, noise);
+    guide.known = pick_u(depth < GUIDED_BOUNCES, guide.known, (UInt)(NO_SLOT));
     // What the last ray brought: what this surface emits, and reflects of what its own cell knows of.  What
     // it reflects of a light that a shadow ray finds is added when that is known.
     const UInt guide_from = pick_u(learning & !camera_ray, get_u(path, PATH_GUIDE), (UInt)(NO_PART));

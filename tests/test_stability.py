@@ -131,6 +131,15 @@ def test_roulette_adds_little_noise_to_paths_of_a_thousand_bounces(device, albed
     np.testing.assert_allclose(image.rgb.mean(), 1.0, rtol=0.05)
 
 
+@pytest.mark.slow
+def test_the_guide_adds_little_noise_to_paths_of_a_thousand_bounces(device):
+    """Where all of them were guided, a few were worth 10^3 times the rest."""
+    settings = {"max_depth": 1000, "termination": "off", "guiding": "learned"}
+    image = render(device, furnace(1.0, 1000), 16, **settings)
+    assert image.rgb.max() < 3.0
+    np.testing.assert_allclose(image.rgb.mean(), 1.0, rtol=0.05)
+
+
 @pytest.mark.parametrize("ior,radii", [(5.0, (1.0,)), (1.5, (1.0, 0.7, 0.4))])
 def test_roulette_does_not_take_the_step_into_glass_for_a_loss(device, ior, radii):
     """Inside of glass of index 5 a path carries a 25th until it leaves, of three of 1.5 an 11th."""

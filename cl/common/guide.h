@@ -16,6 +16,10 @@
 #include "cells.h"
 #include "unit_vector.h"
 
+// Bounces that are guided.  Each multiplies what a path is worth by what the guide is wrong by, which after a
+// thousand bounces leaves all light to a few paths.
+#define GUIDED_BOUNCES 16u
+
 #define NO_PART 0xffffffffu
 
 /// Angle of `y` / `x` over pi / 4, for a ratio in [-1, 1]: an odd polynomial (error below 3e-6).
