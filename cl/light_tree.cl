@@ -15,8 +15,9 @@ static inline LightBounds bounds_of_light(__global const Light *light, float pow
         const float p = light->position[i];
         const float q = triangle ? p + light->e1[i] : p;
         const float r = triangle ? p + light->e2[i] : p;
-        b.low[i] = min(p, min(q, r));
-        b.high[i] = max(p, max(q, r));
+        const float s = light->flags & LIGHT_RECTANGLE ? q + (r - p) : p;
+        b.low[i] = min(min(p, s), min(q, r));
+        b.high[i] = max(max(p, s), max(q, r));
         b.axis[i] = light->direction[i];
     }
     b.power = clamp(light->power * power_unit, 0.0f, 1e36f);

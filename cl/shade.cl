@@ -266,6 +266,10 @@ kernel void shade_paths(
             light_chance(params, lights CHOICE_ARGUMENTS, sampled & !camera_ray, light, last);
         Float pdf_light =
             area_light_density(lights, light, chance, FIELD(path, PATH_HIT_T), fabs(dot3(s.ng, wo)));
+#if RECTANGLES
+        pdf_light = rectangle_density(lights, sampled & !camera_ray, light, chance,
+                                      get_v(path, PATH_ORIGIN_X), pdf_light);
+#endif
         pdf_light = pick(sampled, pdf_light, (Float)(0.0f));
 #else
         const Float pdf_light = (Float)(0.0f);

@@ -49,7 +49,13 @@ from psf_cl.stages import (
     temporal,
 )
 from psf_cl.stages.spec import BufferSpec, Context, Feature, StageSpec
-from psf_cl.tables import distinct_images, few_triangles, flatten, visible_shapes
+from psf_cl.tables import (
+    count_rectangles,
+    distinct_images,
+    few_triangles,
+    flatten,
+    visible_shapes,
+)
 from psf_cl.traits import DeviceTraits
 
 #: Bytes that the passes in flight may take before the ring is made shorter.
@@ -531,6 +537,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "no material has a clear coat, sheen, anisotropy or a coloured reflection",
         ),
         "AREA_LIGHTS": switch(glows, "a shape emits", "no shape emits"),
+        "RECTANGLES": _rectangles(scene, settings, bool(connected.value)),
         "PUNCTUAL_LIGHTS": switch(
             bool(lights),
             f"{len(lights)} lights without extent",
@@ -574,6 +581,18 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "integrator is path",
         ),
     }
+
+
+def _rectangles(scene: Scene, settings: Settings, connected: bool) -> Feature:
+    """Return whether there are lights that are sampled by the solid angle that they fill."""
+    if not connected:
+        return Feature(0, "no light is sampled")
+    if settings.area_sampling == "area":
+        return Feature(0, "area_sampling is area")
+    count = count_rectangles(scene)
+    if not count:
+        return Feature(0, "no rectangle that stands still and glows evenly")
+    return Feature(1, f"{count} lights are rectangles, sampled by the solid angle that they fill")
 
 
 def _back_faces(settings: Settings, materials: list[Material]) -> Feature:

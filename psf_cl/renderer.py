@@ -864,7 +864,12 @@ class Renderer:
         scene, planned = self.scene, {spec.name for spec in self.plan.scene_buffers}
         self.placed = place(scene, self.plan.levels) if self.plan.levels is not None else None
         geometry = tables.flatten(scene) if self.placed is None else self.placed.geometry
-        self.lights = lights = tables.light_table(scene, geometry, self.settings.light_sampling)
+        self.lights = lights = tables.light_table(
+            scene,
+            geometry,
+            self.settings.light_sampling,
+            self.plan.features["RECTANGLES"].value > 0,
+        )
         textures, texels = tables.texture_tables(
             scene.textures if "textures" in planned else (), geometry.count
         )

@@ -90,6 +90,11 @@ class Settings:
     direct_sampling: str = _choice(
         "mis", "light", "bsdf", doc="direct light by both strategies, or by one of them alone"
     )
+    area_sampling: str = _choice(
+        "solid_angle",
+        "area",
+        doc="how points of rectangular lights are drawn: as they are seen, or uniformly",
+    )
     termination: str = _choice("roulette", "off", doc="how paths end before max_depth")
     roulette_depth: int = _number(
         5, 0, 1 << 20, doc="bounces before Russian roulette may end a path"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -450,13 +450,79 @@ def alias_chances(keep: np.ndarray, other: np.ndarray) -> np.ndarray:
     return chance / len(keep)
 
 
-def light_table(scene: Scene, geometry: Geometry, sampling: str) -> np.ndarray:
+#: By how much, relative to their sizes, two triangles may miss a rectangle.
+RECTANGLE_SLACK = 1e-5
+
+#: More lights than these are not looked through for rectangles: each of them is small.
+MOST_IN_RECTANGLES = 4096
+
+
+def _rectangles(scene: Scene, surfaces: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return ``(n,)`` bool: which of the ``triangles`` make a rectangle with the next one.
+
+    They follow one another in a mesh, share an edge, face one way and glow evenly.  No triangle is
+    in two; in scenes that move, or have very many lights, none is in any.
+
+    Args:
+        surfaces: ``(m,)`` layout.SURFACE of all triangles.
+        triangles: ``(n,)`` indices of those that emit, ascending.
+    """
+    whole = np.zeros(len(triangles), bool)
+    if scene.nodes or not 2 <= len(triangles) <= MOST_IN_RECTANGLES:
+        return whole
+    even = np.array([m.alpha_mode == "opaque" and m.emission_texture < 0 for m in scene.materials])
+    even &= [m.emission_curve is None for m in scene.materials]
+    a, b = surfaces[triangles[:-1]], surfaces[triangles[1:]]
+    together = (a["shape"] == b["shape"]) & (triangles[1:] == triangles[:-1] + 1)
+    together &= even[a["material"]] & ((a["ng"] * b["ng"]).sum(axis=1) > 0.999)
+    for first in np.flatnonzero(together):
+        if not (first and whole[first - 1]):
+            whole[first] = _rectangle(a[first], b[first]) is not None
+    return whole
+
+
+def _rectangle(a: np.void, b: np.void) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Return a corner and the edges from it of the rectangle that two triangles make, if any."""
+    one, other = (
+        np.stack([t["p0"], t["p0"] + t["e1"], t["p0"] + t["e2"]]).astype(np.float64) for t in (a, b)
+    )
+    size = np.ptp(np.concatenate([one, other]), axis=0).max()
+    same = np.abs(one[:, None] - other[None]).max(axis=2) <= RECTANGLE_SLACK * size
+    # One corner of each triangle is none of the other's; the two others are, each one of them.
+    apart, beyond = np.flatnonzero(~same.any(axis=1)), np.flatnonzero(~same.any(axis=0))
+    if same.sum() != 2 or len(apart) != 1 or len(beyond) != 1:
+        return None
+    k = int(apart[0])
+    corner = one[k]
+    e1, e2 = one[(k + 1) % 3] - corner, one[(k + 2) % 3] - corner
+    misses = np.abs(corner + e1 + e2 - other[beyond[0]]).max()
+    lengths = np.linalg.norm(e1) * np.linalg.norm(e2)
+    if misses > RECTANGLE_SLACK * size or abs(e1 @ e2) > RECTANGLE_SLACK * lengths:
+        return None
+    return corner, e1, e2
+
+
+def count_rectangles(scene: Scene) -> int:
+    """Return how many lights of the table are rectangles."""
+    if scene.nodes:
+        return 0
+    shapes = tuple(
+        shape for shape in visible_shapes(scene) if emits(scene.materials[shape.material])
+    )
+    surfaces = flatten(replace(scene, shapes=shapes)).surfaces
+    return int(_rectangles(scene, surfaces, np.arange(len(surfaces))).sum())
+
+
+def light_table(
+    scene: Scene, geometry: Geometry, sampling: str, rectangles: bool = False
+) -> np.ndarray:
     """Return ``(n,)`` layout.LIGHT; sets the surfaces' ``light``.
 
     Entries are the emitting triangles (those with an area), the environment, the punctual lights.
 
     Args:
         sampling: what the chances follow: ``"uniform"``, or else the power.
+        rectangles: whether two triangles that make a rectangle are one light.
     """
     glow = np.array([emits(material) for material in scene.materials], bool)
     sided = np.array([2.0 if material.double_sided else 1.0 for material in scene.materials])
@@ -478,6 +544,15 @@ def light_table(scene: Scene, geometry: Geometry, sampling: str) -> np.ndarray:
         area = np.where(sound, area, 0.0)
         sound[:] = True
     triangles, area = triangles[sound], area[sound]
+    whole = np.zeros(len(triangles), bool)
+    if rectangles:
+        whole = _rectangles(scene, geometry.surfaces, triangles)
+    second = np.flatnonzero(whole) + 1
+    area[whole] += area[second]
+    halves = triangles[second]
+    left = np.ones(len(triangles), bool)
+    left[second] = False
+    triangles, area, whole = triangles[left], area[left], whole[left]
 
     sky = has_environment(scene.environment)
     punctual = [light for light in scene.lights if shines(light)]
@@ -489,6 +564,12 @@ def light_table(scene: Scene, geometry: Geometry, sampling: str) -> np.ndarray:
     table["area"][: len(triangles)] = area
     _fill_triangles(table[: len(triangles)], geometry.surfaces[triangles], scene.materials)
     geometry.surfaces["light"][triangles] = np.arange(len(triangles))
+    geometry.surfaces["light"][halves] = np.flatnonzero(whole)
+    for light, half in zip(np.flatnonzero(whole), halves, strict=True):
+        row, pair = table[light], geometry.surfaces[[triangles[light], half]]
+        row["position"], row["e1"], row["e2"] = _rectangle(*pair)
+        row["offset"] = pair["offset"].max()
+        row["flags"] |= layout.CONSTANT["LIGHT_RECTANGLE"]
     of = material[triangles]
     power[: len(triangles)] = area * radiance[of] * sided[of] * math.pi
     # A texture may be black on average and still glow somewhere.

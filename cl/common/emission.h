@@ -92,9 +92,15 @@ LARGE_FUNCTION Emission emit(
         Float u2;
         light_point(e.point, &u1, &u2);
         const Float root = sqrt(u1);
-        const Float b1 = root * (1.0f - u2);
-        const Float b2 = root * u2;
-        const Mask two_sided = (GATHER_U(lights, light, flags) & MATERIAL_TWO_SIDED_EMISSION) != 0u;
+        Float b1 = root * (1.0f - u2);
+        Float b2 = root * u2;
+        const UInt flags = GATHER_U(lights, light, flags);
+#if RECTANGLES
+        const Mask whole = (flags & LIGHT_RECTANGLE) != 0u;
+        b1 = pick(whole, u1, b1);
+        b2 = pick(whole, u2, b2);
+#endif
+        const Mask two_sided = (flags & MATERIAL_TWO_SIDED_EMISSION) != 0u;
         const Float side = pick(two_sided & (side_bits >= 0x80000000u), (Float)(-1.0f), (Float)(1.0f));
         const Vec3 outward = scale(axis, side);
         const Vec3 origin = add_scaled(add_scaled(add_scaled(position, e1, b1), e2, b2), outward,

@@ -34,6 +34,9 @@
 #ifndef AREA_LIGHTS
 #error "AREA_LIGHTS must be 0 or 1"
 #endif
+#ifndef RECTANGLES
+#error "RECTANGLES must be 0 or 1 (some area lights are)"
+#endif
 #ifndef PUNCTUAL_LIGHTS
 #error "PUNCTUAL_LIGHTS must be 0 or 1"
 #endif

@@ -21,6 +21,7 @@
 #define TEXTURE_MIRROR_V 8u
 #define TEXTURE_NEAREST 16u
 #define TEXTURE_SRGB 32u
+#define LIGHT_RECTANGLE 256u // the light is two triangles: e1 and e2 are edges of a rectangle
 #define LIGHT_TRIANGLE 0u
 #define LIGHT_ENVIRONMENT 1u
 #define LIGHT_POINT 2u
@@ -490,7 +491,7 @@ typedef struct {
     float area; // m^2, of a triangle
     float offset; // of a triangle, as Surface.offset
     uint emission_texture; // index, NO_TEXTURE for none
-    uint flags; // of the material
+    uint flags; // of the material; LIGHT_RECTANGLE
     float power; // candela along its brightest direction, or lux from infinitely far
     float pad[4]; // fills the record
 } Light;

@@ -6,6 +6,7 @@
 #include "alpha.h"
 #include "light_tree.h"
 #include "particle_map.h"
+#include "rectangle.h"
 #include "rng.h"
 #include "surface.h"
 
@@ -185,6 +186,28 @@ static inline Float area_light_density(
     const Float pdf = chance * t * t / max(cosine * area, 1e-30f);
     return pick((cosine > 0.0f) & (area > 0.0f), pdf, (Float)(0.0f));
 }
+
+#if RECTANGLES
+/// The same as seen from `from`, of which `by_area` is the density of triangles.
+static inline Float rectangle_density(
+    __global const Light *lights, Mask active, UInt light, Float chance, Vec3 from, Float by_area)
+{
+    active &= (GATHER_U(lights, light, flags) & LIGHT_RECTANGLE) != 0u;
+    if (!any_lane(active))
+        return by_area;
+    const Vec3 corner = vec3(GATHER(lights, light, position[0]), GATHER(lights, light, position[1]),
+                             GATHER(lights, light, position[2]));
+    const Vec3 e1 =
+        vec3(GATHER(lights, light, e1[0]), GATHER(lights, light, e1[1]), GATHER(lights, light, e1[2]));
+    const Vec3 e2 =
+        vec3(GATHER(lights, light, e2[0]), GATHER(lights, light, e2[1]), GATHER(lights, light, e2[2]));
+    active &= is_close(corner, e1, e2, from);
+    if (!any_lane(active))
+        return by_area;
+    const SeenRectangle seen = see_rectangle(corner, e1, e2, from);
+    return pick(active & is_wide(seen) & (by_area > 0.0f), chance / seen.solid, by_area);
+}
+#endif
 #endif
 
 // What choosing a light takes beside the table.
@@ -365,13 +388,31 @@ LARGE_FUNCTION LightSample sample_light(
         const Float away = 2.0f * GATHER(lights, light, offset) + 0x1.8p-20f * reach;
         // Uniform on the triangle, without folding, so that strata stay connected.
         const Float root = sqrt(u1);
-        const Float b1 = root * (1.0f - u2);
-        const Float b2 = root * u2;
+        Float b1 = root * (1.0f - u2);
+        Float b2 = root * u2;
+        const UInt flags = GATHER_U(lights, light, flags);
+#if RECTANGLES
+        const Mask whole = on_triangle & ((flags & LIGHT_RECTANGLE) != 0u);
+        b1 = pick(whole, u1, b1);
+        b2 = pick(whole, u2, b2);
+        Mask near = whole & is_close(p0, e1, e2, origin);
+        Float solid = (Float)(1.0f);
+        if (any_lane(near)) {
+            const SeenRectangle seen = see_rectangle(p0, e1, e2, origin);
+            near &= is_wide(seen);
+            solid = pick(near, seen.solid, solid);
+            Float part1;
+            Float part2;
+            sample_rectangle(seen, u1, u2, &part1, &part2);
+            b1 = pick(near, part1, b1);
+            b2 = pick(near, part2, b2);
+        }
+#endif
         Vec3 q = add_scaled(add_scaled(p0, e1, b1), e2, b2);
         q = add_scaled(q, ng, pick(dot3(ng, sub(origin, q)) >= 0.0f, away, -away));
         const Vec3 toward = sub(q, origin);
         const Vec3 wi = normalize3(toward);
-        const Mask two_sided = (GATHER_U(lights, light, flags) & MATERIAL_TWO_SIDED_EMISSION) != 0u;
+        const Mask two_sided = (flags & MATERIAL_TWO_SIDED_EMISSION) != 0u;
         const Float cosine = -dot3(ng, wi);
         const Mask lit = on_triangle & ((cosine > 0.0f) | two_sided) & (area > 0.0f);
         Vec3 emission = vec3(GATHER(lights, light, intensity[0]), GATHER(lights, light, intensity[1]),
@@ -384,7 +425,10 @@ LARGE_FUNCTION LightSample sample_light(
         // Holes of an emitter give no light; the shadow ray ends before it could find that out.
         emission = scale(emission, alpha_share(lit, triangle, b1, b2 ALPHA_BUFFER_ARGUMENTS));
 #endif
-        const Float pdf = pmf * dot3(toward, toward) / max(fabs(cosine) * area, 1e-30f);
+        Float pdf = pmf * dot3(toward, toward) / max(fabs(cosine) * area, 1e-30f);
+#if RECTANGLES
+        pdf = pick(near, pmf / solid, pdf);
+#endif
         s.toward = pick_v(lit, toward, s.toward);
         s.wi = pick_v(lit, wi, s.wi);
         s.radiance = pick_v(lit, emission, s.radiance);

@@ -373,7 +373,7 @@ LIGHT = Record(
     float area - m^2, of a triangle
     float offset - of a triangle, as Surface.offset
     uint emission_texture - index, NO_TEXTURE for none
-    uint flags - of the material
+    uint flags - of the material; LIGHT_RECTANGLE
     float power - candela along its brightest direction, or lux from infinitely far
     float pad[4] - fills the record
     """),
@@ -871,6 +871,7 @@ CONSTANTS = (
     ("TEXTURE_MIRROR_V", 8, ""),
     ("TEXTURE_NEAREST", 16, ""),
     ("TEXTURE_SRGB", 32, ""),
+    ("LIGHT_RECTANGLE", 256, "the light is two triangles: e1 and e2 are edges of a rectangle"),
     ("LIGHT_TRIANGLE", 0, ""),
     ("LIGHT_ENVIRONMENT", 1, ""),
     ("LIGHT_POINT", 2, ""),

@@ -75,6 +75,7 @@ def plan(context: Context) -> StageSpec | None:
             "TEXTURES",
             "VERTEX_COLORS",
             "AREA_LIGHTS",
+            "RECTANGLES",
             "PUNCTUAL_LIGHTS",
             "ENVIRONMENT",
             "ALPHA",

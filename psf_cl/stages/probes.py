@@ -30,6 +30,7 @@ def plan(context: Context) -> StageSpec | None:
             "SMOOTH",
             "VERTEX_COLORS",
             "AREA_LIGHTS",
+            "RECTANGLES",
             "PUNCTUAL_LIGHTS",
             "ENVIRONMENT",
             "ALPHA",

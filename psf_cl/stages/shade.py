@@ -36,6 +36,7 @@ def plan(context: Context) -> StageSpec:
             "TANGENTS",
             "LAYERS",
             "AREA_LIGHTS",
+            "RECTANGLES",
             "PUNCTUAL_LIGHTS",
             "ENVIRONMENT",
             "ALPHA",
