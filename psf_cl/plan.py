@@ -492,6 +492,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
         for m in materials
     )
     connected = _connect(settings, any(emits(m) for m in materials) or sky, bool(lights))
+    rectangles = _rectangles(scene, settings, bool(connected.value))
     feature_aovs = outputs & {"albedo", "normal", "depth"}
     return {
         "TEXTURES": switch(
@@ -537,7 +538,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "no material has a clear coat, sheen, anisotropy or a coloured reflection",
         ),
         "AREA_LIGHTS": switch(glows, "a shape emits", "no shape emits"),
-        "RECTANGLES": _rectangles(scene, settings, bool(connected.value)),
+        "RECTANGLES": rectangles,
         "PUNCTUAL_LIGHTS": switch(
             bool(lights),
             f"{len(lights)} lights without extent",
@@ -550,7 +551,9 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             else "the environment is black",
         ),
         "CONNECT": connected,
-        "LIGHT_SAMPLING": _light_sampling(settings, bool(connected.value), _light_count(scene)),
+        "LIGHT_SAMPLING": _light_sampling(
+            settings, bool(connected.value), _light_count(scene, bool(rectangles.value))
+        ),
         "LENS": _lens(scene),
         "MOTION": _motion(scene),
         "AOV_DIRECT": switch(
@@ -776,19 +779,21 @@ def _light_sampling(settings: Settings, connected: bool, lights: int) -> Feature
     return Feature(2, f"light_sampling is photon: photons of {lights} lights say which are seen")
 
 
-def _light_count(scene: Scene) -> int:
-    """Return the entries of the light table, or a few more."""
+def _light_count(scene: Scene, rectangles: bool) -> int:
+    """Return the entries of the light table, or a few more; of ``rectangles`` one for each."""
     emitting = sum(
         len(shape.mesh.triangles)
         for shape in scene.shapes
         if emits(scene.materials[shape.material])
     )
+    if rectangles:
+        emitting -= count_rectangles(scene)
     return emitting + sum(map(shines, scene.lights)) + has_environment(scene.environment)
 
 
 def _scene_buffers(context: Context, scene: Scene) -> tuple[BufferSpec, ...]:
     triangles = context.triangle_count
-    lights = _light_count(scene)
+    lights = _light_count(scene, context.on("RECTANGLES"))
     float32, uint8 = np.dtype(np.float32), np.dtype(np.uint8)
     buffers = [
         BufferSpec("params", layout.PARAMS.dtype, 1, "camera and settings"),

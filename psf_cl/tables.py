@@ -503,12 +503,12 @@ def _rectangle(a: np.void, b: np.void) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def count_rectangles(scene: Scene) -> int:
-    """Return how many lights of the table are rectangles."""
-    if scene.nodes:
-        return 0
+    """Return how many lights of the table are rectangles, if it is made with these."""
     shapes = tuple(
         shape for shape in visible_shapes(scene) if emits(scene.materials[shape.material])
     )
+    if scene.nodes or sum(len(shape.mesh.triangles) for shape in shapes) > MOST_IN_RECTANGLES:
+        return 0
     surfaces = flatten(replace(scene, shapes=shapes)).surfaces
     return int(_rectangles(scene, surfaces, np.arange(len(surfaces))).sum())
 

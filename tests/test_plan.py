@@ -34,6 +34,10 @@ LEVELS = Texture("levels", np.full((2, 2, 4), 128, np.uint8))
 LIFTED = transform.translation((0, 0.5, 0)) @ transform.scaling(0.3)
 LOW = transform.translation((0, 0.2, 0))
 FLAT_QUAD = primitives.quad()
+#: No rectangle: these are another flag.
+RHOMBUS = replace(
+    FLAT_QUAD, positions=FLAT_QUAD.positions + 0.1 * FLAT_QUAD.positions[:, [2, 1, 0]]
+)
 
 #: What a flag of the plan needs: shapes, lights, a sky, a lens, an AOV or a device that wants it.
 PARTS = {
@@ -46,7 +50,7 @@ PARTS = {
     "SMOOTH": (primitives.sphere(5, 4), LIFTED, lambertian(0.5)),
     "GLOSSY": (FLAT_QUAD, LIFTED, Material()),
     "TRANSMISSION": (primitives.box(), LIFTED, Material(transmission=1.0, roughness=0.3)),
-    "AREA_LIGHTS": (inside_out(FLAT_QUAD), LIFTED, glowing(3.0)),
+    "AREA_LIGHTS": (inside_out(RHOMBUS), LIFTED, glowing(3.0)),
 }
 LIGHTS = {"PUNCTUAL_LIGHTS": Light("point", (1.0, 1.0, 1.0), position=(0.0, 1.0, 1.0))}
 SKIES = {
@@ -245,7 +249,9 @@ def test_every_flag_at_once_renders(wants):
     layered = Material(clearcoat=1.0, anisotropy=0.5, back_hidden=True)
     colored = replace(FLAT_QUAD, colors=np.ones((len(FLAT_QUAD.positions), 4), np.float32))
     shape = replace(scene.shapes[0], mesh=colored, material=len(scene.materials))
-    scene = replace(scene, shapes=(*scene.shapes, shape), materials=(*scene.materials, layered))
+    lamp = replace(scene.shapes[0], mesh=FLAT_QUAD, material=len(scene.materials) + 1)
+    materials = (*scene.materials, layered, glowing(1.0))
+    scene = replace(scene, shapes=(*scene.shapes, shape, lamp), materials=materials)
     opened = renderer(
         wants(flags),
         scene,
