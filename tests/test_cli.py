@@ -490,6 +490,7 @@ def test_plan_follows_the_options(all_features, capsys):
         "LIGHT_SAMPLING",
         "METROPOLIS",
         "MOTION",
+        "RECTANGLES",
         "RESTORE",
         "SEEN",
         "SPARSE",
