@@ -130,6 +130,21 @@ def test_shares_of_a_thousand_cells_sum_to_one_and_follow_their_particles(lane_d
     filled.release()
 
 
+@pytest.mark.parametrize("part", [2.0**-13, 2.0**-10, 0.3125, 1.0])
+def test_numbers_stay_uniform_however_small_the_choice_before_them(lane_device, part):
+    """Of 24 bits few values are left: the bins between them are as full as those around them."""
+    rng = np.random.default_rng(11)
+    draws, bins = 1 << 18, 1 << 14
+    bits = rng.choice(int(part * 2**32), draws, replace=False).astype(np.uint32)
+    filled = Map(lane_device, 1)
+    inputs = {"bits": bits, "parts": np.full(draws, part, np.float32)}
+    (left,) = filled.run("go_on", inputs, {"left": (np.uint32, 1)})
+    filled.release()
+    often = np.bincount(left // np.uint32(2**32 // bins), minlength=bins)
+    mean = draws / bins
+    assert abs(((often - mean) ** 2 / mean).sum() - bins) < 6.0 * (2.0 * bins) ** 0.5
+
+
 def test_draws_follow_the_shares_and_leave_a_number_that_is_uniform(lane_device):
     """A lattice of numbers draws each node as often as its chance says."""
     rng = np.random.default_rng(9)

@@ -249,12 +249,6 @@ static inline LightChoice choose_in_table(__global const Light *lights, uint lig
 }
 
 #if LIGHT_PHOTONS
-/// 32 bits of a number in [0, 1), the lowest ones from `more`.
-static inline UInt bits_of(Float u, UInt more)
-{
-    return to_uint(clamp(u, (Float)(0.0f), (Float)(0x1.fffffep-1f)) * 0x1p32f) ^ (more & 0xffu);
-}
-
 /// Chance that choose_light draws the group of a light.
 static inline Float group_chance(
     __global const uint *table, __global const LightGroup *groups, Mask active, UInt row, UInt light)
@@ -284,14 +278,15 @@ static inline LightChoice choose_light(
     const Mask blind = active & (u < kept);
     // What is left of the number is uniform either way; digits that it has run out of are made up.
     u = pick(blind, u / kept, (u - kept) / (1.0f - kept));
-    UInt group = choose_node(particle_table, known & !blind, q.row, &u);
+    Float part;
+    UInt group = choose_node(particle_table, known & !blind, q.row, &u, &part);
     bits = mix_bits(bits + 0x9e3779b9u);
     if (any_lane(blind)) {
-        const LightChoice any = choose_in_table(lights, count, bits_of(u, bits));
+        const LightChoice any = choose_in_table(lights, count, digits_left(u, kept, bits));
         group = pick_u(blind, GATHER_U(light_groups, any.light, node), group);
         bits = mix_bits(bits);
     }
-    bits = pick_u(blind, bits, bits_of(u, bits));
+    bits = pick_u(blind, bits, digits_left(u, part * (1.0f - kept), bits));
     const Mask there = active & (group != NO_LIGHT);
     const UInt pair = pick_u(there, group >> 1, (UInt)(0u));
     const UInt node = pick_u((group & 1u) == 0u, GATHER_U(light_pairs, pair, child[0]),

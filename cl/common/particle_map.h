@@ -253,9 +253,17 @@ static inline Float node_chance(__global const uint *table, Mask active, UInt ro
     return pick(own, node_share(table, row, i), (Float)(0.0f));
 }
 
-/// Draw a node of a row by `*u` in [0, 1), of which is left what is uniform in the node; its chance is what
-/// node_chance says.
-static inline UInt choose_node(__global const uint *table, Mask active, UInt row, Float *u)
+/// 32 uniform bits of `u`, which is what is left of a number of 24 bits after a choice of chance `part`: it has
+/// only so many values, and the digits between them come from `more`.
+static inline UInt digits_left(Float u, Float part, UInt more)
+{
+    const Float whole = u + unit_float(more) * 0x1p-24f / max(part, 0x1p-24f);
+    return to_uint(clamp(whole, (Float)(0.0f), (Float)(0x1.fffffep-1f)) * 0x1p32f) ^ (more & 0xffu);
+}
+
+/// Draw a node of a row by `*u` in [0, 1), of which is left what is uniform in the node; `*part` is its chance,
+/// as node_chance says.
+static inline UInt choose_node(__global const uint *table, Mask active, UInt row, Float *u, Float *part)
 {
     row = pick_u(active, row, (UInt)(0u));
     const UInt length = pick_u(active, record_word(table, row, RECORD_LENGTH), (UInt)(0u));
@@ -266,6 +274,7 @@ static inline UInt choose_node(__global const uint *table, Mask active, UInt row
     const UInt at = first + RECORD_SHARES + i;
     const Float before =
         pick(i > 0u, from_bits(GATHER_WORD(table, pick_u(i > 0u, at - 1u, at))), (Float)(0.0f));
-    *u = pick(active, (*u - before) / max(node_share(table, row, i), 1e-9f), *u);
+    *part = node_share(table, row, i);
+    *u = pick(active, (*u - before) / max(*part, 1e-9f), *u);
     return GATHER_WORD(table, first + RECORD_NODES + i);
 }

@@ -90,10 +90,20 @@ kernel void draw_particles(
 {
     const UInt row = row_of(params, table, LOAD_U(cells, 0));
     Float u = LOAD(numbers, 0);
-    const UInt node = choose_node(table, row != NO_PLACE, row, &u);
+    Float part;
+    const UInt node = choose_node(table, row != NO_PLACE, row, &u, &part);
     STORE_U(nodes, 0, node);
     STORE(left, 0, u);
-    STORE(chances, 0, node_chance(table, MASK_ALL, row, node));
+    STORE(chances, 0, pick(part == node_chance(table, MASK_ALL, row, node), part, (Float)(NAN)));
+}
+
+/// What is left of random bits below `part`.
+kernel void go_on(
+    global const Params *params, global const uint *bits, global const float *parts, global uint *left)
+{
+    const Float part = LOAD(parts, 0);
+    const UInt drawn = LOAD_U(bits, 0);
+    STORE_U(left, 0, digits_left(unit_float(drawn) / part, part, mix_bits(drawn + 0x9e3779b9u)));
 }
 
 /// The first place of each cell, and what tells its particles from others.
