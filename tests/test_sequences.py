@@ -41,12 +41,14 @@ def test_dark_frames_are_measured_and_dark_sequences_refused():
         sequences.Truth.of(steps(0.0, 0.0))
 
 
-def test_lag_is_the_frame_from_which_on_errors_are_those_of_a_fresh_start():
+def test_lag_is_the_frame_from_which_errors_stay_those_of_a_fresh_start():
     fresh = np.array((8.0, 4.0, 2.0, 1.0))
     assert sequences.lag(fresh, fresh) == 1
     assert sequences.lag(np.array((8.0, 5.0, 2.1, 1.0)), fresh) == 3
     assert sequences.lag(np.array((1.0, 5.0, 5.0, 1.09)), fresh) == 4
     assert sequences.lag(np.array((1.0, 1.0, 1.0, 1.2)), fresh) is None
+    flat = np.ones(9)
+    assert sequences.lag(np.array((1.0, 2.0, 1.0, 1.0, 1.0, 1.0, 1.2, 1.2, 1.0)), flat) == 3
 
 
 def test_flicker_is_the_variance_of_independent_frames_where_the_truth_rests():

@@ -12,6 +12,9 @@ from psf_cl.measure.errors import mean_luminance, relative_weights
 #: A sequence has caught up when its error is at most so many times that of a fresh start.
 CAUGHT_UP = 1.1
 
+#: Frames for which it has to be, for one may be near by chance.
+HELD = 4
+
 #: Pixels whose references differ by less, relative as in relMSE, rest from one frame to the next.
 REST = 0.05
 
@@ -76,15 +79,17 @@ def flicker(pictures: Sequence[np.ndarray], truth: Truth) -> float:
 
 
 def lag(errors: np.ndarray, fresh: np.ndarray) -> int | None:
-    """Return in which frame since a change the error has caught up with a fresh start, for good.
+    """Return in which frame since a change the error has caught up with a fresh start.
+
+    It has when it is within the bound for ``HELD`` frames, or for all that are left.
 
     Args:
         errors: of the frames since the change, its own first.
         fresh: of a start in the frame of the change; as many.
 
     Returns:
-        1 for the frame of the change itself; None if it has not caught up in the last frame.
+        1 for the frame of the change itself; None if it never has.
     """
-    behind = np.flatnonzero(errors > CAUGHT_UP * fresh)
-    after = 1 + (int(behind[-1]) + 1 if len(behind) else 0)
-    return after if after <= len(errors) else None
+    within = errors <= CAUGHT_UP * fresh
+    held = [bool(within[frame : frame + HELD].all()) for frame in range(len(within))]
+    return held.index(True) + 1 if any(held) else None
