@@ -269,8 +269,8 @@ def test_kernels_declare_the_fields_of_a_path_that_their_sources_use():
             # It finds the word itself, in a pool of any lanes.
             assert "PATH_STATUS) * BLOCK" in assemble(stage.source)
             reads = {"status"}
-        if stage.name == "probes":
-            # It has no paths, but sees the macro for the seeds of theirs.
+        if stage.name in ("probes", "cells"):
+            # They have no paths, but see the macro for the seeds of theirs.
             assert reads == {"seed", "sample"}
             reads = set()
         if stage.name == "photons":

@@ -23,6 +23,8 @@ FEWEST, MOST = 1 << 14, 1 << 20
 #: Cells of the map, a power of two.
 CELLS = 1 << 15
 
+PLACES = layout.CONSTANT["PARTICLE_PLACES"]
+
 #: Words of what the table knows of a cell.
 RECORD_WORDS = 4 + 2 * layout.CONSTANT["PARTICLE_KINDS"]
 
@@ -49,7 +51,7 @@ def plan(context: Context) -> StageSpec | None:
     if context.features["LIGHT_SAMPLING"].value < 2:
         return None
     uint32 = np.dtype(np.uint32)
-    places = CELLS * layout.CONSTANT["PARTICLE_PLACES"]
+    places = CELLS * PLACES
     words = context.traits.slots * context.path_field_count
     kernels = (
         KernelSpec(
@@ -65,7 +67,7 @@ def plan(context: Context) -> StageSpec | None:
             hash_accesses=1,
         ),
         KernelSpec("settle_photons", reads=("shadow_z",), record_bytes=8, hash_accesses=1),
-        KernelSpec("tabulate_photons", record_bytes=20),
+        KernelSpec("tabulate_photons", record_bytes=8 * PLACES + 4 * RECORD_WORDS),
     )
     return StageSpec(
         "photons",
