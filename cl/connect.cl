@@ -7,6 +7,7 @@
 #include "common/trace.h"
 #include "common/sharing.h"
 #include "common/guide.h"
+#include "common/cache.h"
 
 /// Trace the shadow rays of the W paths of a work item; returns how many there were.
 static inline uint connect_paths(
@@ -15,6 +16,11 @@ static inline uint connect_paths(
 #if GUIDE
     volatile __global uint *counters,
     __global GuideSum *guide_sums,
+#endif
+#if CACHE
+    volatile __global uint *cache_counters,
+    __global CacheSum *cache_sums,
+    __global const CacheCell *cache_cells,
 #endif
     GEOMETRY_BUFFERS)
 {
@@ -57,6 +63,12 @@ static inline uint connect_paths(
 #if AOV_DIRECT
     put_v(path, PATH_DIRECT_R, add(get_v(path, PATH_DIRECT_R), pick_v(depth == 0u, arrives, zero)));
 #endif
+#if CACHE
+    const UInt bits = mix_bits(get_u(path, PATH_SEED) + get_u(path, PATH_SAMPLE) * 0x85ebca6bu
+                               + get_u(path, PATH_STATUS) * 0x9e3779b9u);
+    learn_cached(params, cache_sums, cache_cells, cache_counters, wanted & !blocked, get_u(path, PATH_CACHE),
+                 get_v(path, PATH_CACHE_LIGHT_R), bits);
+#endif
 #if GUIDE
     // What the ray before met reflects this light along it.
     const UInt noise = mix_bits(get_u(path, PATH_SEED) + get_u(path, PATH_SAMPLE) * 0x9e3779b9u
@@ -74,13 +86,18 @@ static inline uint connect_paths(
 ///
 /// reads   pool.{shadow, toward, light, status, vertex}; with GUIDE pool.{guide_from, guide_light, sample, seed};
 ///         geometry
-/// writes  pool.radiance (direct, beyond), pool.light (cleared); counters.pending_shadow; with GUIDE guide_sums
+/// writes  pool.radiance (direct, beyond), pool.light (cleared); counters.pending_shadow; with GUIDE guide_sums;
+///         with CACHE cache_sums, counters.cache_rejected
 kernel void connect_lights(
     __global const Params *params,
     __global float *pool,
     volatile __global uint *counters,
 #if GUIDE
     __global GuideSum *guide_sums,
+#endif
+#if CACHE
+    __global CacheSum *cache_sums,
+    __global const CacheCell *cache_cells,
 #endif
     GEOMETRY_BUFFERS)
 {
@@ -91,6 +108,9 @@ kernel void connect_lights(
         wanted += connect_paths(params, pool_at(pool, item),
 #if GUIDE
                                 counters, guide_sums,
+#endif
+#if CACHE
+                                counters, cache_sums, cache_cells,
 #endif
                                 GEOMETRY_BUFFER_ARGUMENTS);
     if (wanted > 0)

@@ -15,6 +15,7 @@
 #include "common/chain.h"
 #include "common/guide.h"
 #include "common/guided.h"
+#include "common/cache.h"
 #include "common/motion.h"
 
 #define MAX_SURVIVAL 0.999f
@@ -144,7 +145,8 @@ static inline void store_features(
 ///         with LIGHT_SAMPLING pool.{light_normal, particle_row};
 ///         with CELLS pool.{vertex, length, beyond, share, light_share}, vertices; with GUIDE
 ///         pool.{guide, guide_from, guide_light, expected}, guide_keys, guide_full, guide_sums,
-///         counters.{guide_failed, guide_rejected} (atomic)
+///         counters.{guide_failed, guide_rejected} (atomic); with CACHE pool.{cache, cache_gate, cache_light},
+///         cache_keys, cache_full, cache_sums, counters.{cache_failed, cache_rejected, cache_ends} (atomic)
 kernel void shade_paths(
     __global const Params *params,
     __global const Surface *surfaces,
@@ -177,8 +179,16 @@ kernel void shade_paths(
     __global float *chains,
     __global uint *chain_numbers,
 #endif
-#if GUIDE
+#if GUIDE || CACHE
     volatile __global uint *counters,
+#endif
+#if CACHE
+    volatile __global uint *cache_keys,
+    __global uint *cache_full,
+    __global CacheSum *cache_sums,
+    __global const CacheCell *cache_cells,
+#endif
+#if GUIDE
     volatile __global uint *guide_keys,
     __global uint *guide_full,
     __global GuideSum *guide_sums,
@@ -331,7 +341,7 @@ kernel void shade_paths(
     }
 #endif
 
-    const Mask goes_on = hit & (depth < params->max_depth);
+    Mask goes_on = hit & (depth < params->max_depth);
     const Mask delta = is_delta(b);
 #if SEEN
 #if INSTANCES
@@ -356,9 +366,17 @@ kernel void shade_paths(
     if (any_lane(sees))
         store_seen(params, seen, sees, hit, sample, pixel, shape, s.p, before, s.ns, zero);
 #endif
-#if GUIDE
+#if GUIDE || CACHE
     const UInt noise = mix_bits(mix_bits(get_u(path, PATH_SEED) + depth * 0x9e3779b9u) + sample);
     const Mask learning = alive & (sample < counters[COUNTER_LEARN_LIMIT]);
+#endif
+#if CACHE
+    const UInt cache_noise = mix_bits(noise + 0x6a09e667u);
+    UInt cache = pick_u(learning & !camera_ray, get_u(path, PATH_CACHE), (UInt)(NO_SLOT));
+    Vec3 cache_gate = get_v(path, PATH_CACHE_GATE_R);
+    learn_cached(params, cache_sums, cache_cells, counters, learning, cache, mul(cache_gate, emitted), cache_noise);
+#endif
+#if GUIDE
     const Mask guided = goes_on & !delta & (Mask)(counters[COUNTER_GUIDE_OFF] ? 0 : -1);
     Guide guide =
         find_guide(params, guide_keys, guide_cells, guide_full, counters, guided, learning, s.p, s.ns, noise);
@@ -416,6 +434,60 @@ kernel void shade_paths(
         store_cell_vertices(params, vertices, chosen, sample, pixel, s.p, s.ng, gate, length);
         put_u(path, PATH_VERTEX, pick_u(chosen, depth + 1u, get_u(path, PATH_VERTEX)));
     }
+#endif
+
+#if CACHE
+    const Mask matt = goes_on & (chances.diffuse >= 1.0f) & (max3(b.base_color) > CACHE_LEAST_REFLECTANCE);
+    const Cached cached = find_cached(params, cache_keys, cache_cells, cache_full, counters, matt, learning,
+                                      s.p, s.ns, cache_noise);
+    const Vec3 reflected_here = mul(b.base_color, cached.mean);
+    learn_cached(params, cache_sums, cache_cells, counters, learning & cached.known, cache,
+                 mul(cache_gate, reflected_here), mix_bits(cache_noise));
+    // Next to the last vertex a cell is too coarse: in corners paths go on.  Some go on everywhere and teach;
+    // were all those of corners to teach, cells would learn what corners see.
+    const Mask teaches = learning & ((noise & 15u) == 0u);
+    Mask may_end = cached.known & !camera_ray & !teaches & (FIELD(path, PATH_HIT_T) > 0.5f * cached.edge);
+#if CELLS
+    may_end &= vertex != 0u;
+#endif
+    const Float ends = pick(may_end, cached.ends, (Float)(0.0f));
+    const Mask ended = unit_float(mix_bits(cache_noise ^ 0x3c6ef372u)) < ends;
+    if (any_lane(ends > 0.0f)) {
+        const Float on = 1.0f / pick(ended, (Float)(1.0f), 1.0f - ends);
+        const Vec3 taken = pick_v(ends > 0.0f, scale(mul(beta, reflected_here), pick(ended, (Float)(1.0f), 1.0f - on)), zero);
+        beta = scale(beta, on);
+#if CELLS == 2
+        const Vec3 left = gather_light(path, shares_connection(params, vertex, depth), share, taken);
+#elif CELLS
+        const Vec3 left =
+            gather_light(path, shares_connection(params, vertex, depth), vec3_all((Float)(1.0f)), taken);
+#else
+        put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), taken));
+        const Vec3 left = taken;
+#endif
+#if BASE == 2
+        keep_base(path, ends > 0.0f, base_part, left);
+#elif BASE
+        keep_base(path, ends > 0.0f, vec3_all((Float)(1.0f)), left);
+#endif
+#if GUIDE
+        // Of this the guide knows only what no shadow ray finds.
+        const Float more = max(luminance(reflected_here) - luminance(b.base_color) * guide.mean, (Float)(0.0f));
+        learn(params, guide_sums, counters, learning & ended, guide_from, more, 0, cache_noise);
+#endif
+        goes_on &= !ended;
+        count_up(&counters[COUNTER_CACHE_ENDS], count_lanes(ended));
+    }
+    // Few records are opened where much is known, and not all elsewhere: a path has one at a time, and what
+    // the camera does not see is learned too.
+    const Mask opens = learning & matt & goes_on & (cached.slot != NO_SLOT)
+                       & ((cached.known & ((camera_ray & ((noise & 48u) == 0u)) | teaches))
+                          | (!cached.known & (cache == NO_SLOT) & ((noise & 16u) != 0u)));
+    cache = pick_u(cached.known & !opens, (UInt)(NO_SLOT), pick_u(opens, cached.slot, cache));
+    cache_gate = pick_v(opens, vec3(inverse_reflectance(b.base_color.x), inverse_reflectance(b.base_color.y),
+                                    inverse_reflectance(b.base_color.z)), cache_gate);
+    visit_cached(cache_sums, opens, cache);
+    put_u(path, PATH_CACHE, cache);
 #endif
 
     // The seed names the pixel by its place on the film; it travels with the path.
@@ -479,6 +551,10 @@ kernel void shade_paths(
         put_u(path, PATH_GUIDE_FROM, guide_from);
         FIELD(path, PATH_GUIDE_LIGHT) = luminance(
             mul(f, scale(light.radiance, weight / pick(lit, light.pdf, (Float)(1.0f)))));
+#endif
+#if CACHE
+        put_v(path, PATH_CACHE_LIGHT_R,
+              mul(mul(cache_gate, f), scale(light.radiance, weight / pick(lit, light.pdf, (Float)(1.0f)))));
 #endif
 #if CELLS == 2
         put_v(path, PATH_LIGHT_SHARE_R, pick_v(chosen, base_share(b, chances, base, wi_local, f), share));
@@ -551,6 +627,10 @@ kernel void shade_paths(
 #endif
     survives &= left_of_choice(chances, u_lobe) < chance;
     beta = scale(beta, 1.0f / pick(survives, chance, (Float)(1.0f)));
+#if CACHE
+    const Float step = 1.0f / pick(survives, pdf * chance, (Float)(1.0f));
+    put_v(path, PATH_CACHE_GATE_R, mul(cache_gate, scale(f, step)));
+#endif
 
     put_v(path, PATH_BETA_R, beta);
     put_v(path, PATH_ORIGIN_X, ray_origin(s, wi));

@@ -31,6 +31,7 @@ from psf_cl.scene.model import (
 from psf_cl.settings import Settings, check_together
 from psf_cl.stages import (
     animate,
+    cache,
     camera,
     cells,
     connect,
@@ -333,6 +334,7 @@ def make_plan(
         temporal,
         screen,
         guide,
+        cache,
         restore,
     ):
         stage = module.plan(context)
@@ -571,6 +573,11 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "guiding is learned",
             "guiding is off",
         ),
+        "CACHE": switch(
+            settings.termination == "cache",
+            "termination is cache",
+            f"termination is {settings.termination}",
+        ),
         "CELLS": _cells(settings, glossy),
         "SPARSE": _sparse(settings),
         "WALLS": _walls(settings),
@@ -731,6 +738,8 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     full["METROPOLIS"] = features["METROPOLIS"]
     # Directions would be drawn otherwise: the image would have other noise.
     full["GUIDE"] = features["GUIDE"]
+    # Paths would end elsewhere.
+    full["CACHE"] = features["CACHE"]
     if features["METROPOLIS"].value:
         names = (
             "AOV_CELLS",

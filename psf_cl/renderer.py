@@ -42,6 +42,7 @@ from psf_cl.scene.model import Scene
 from psf_cl.scheduler import MAX_PASSES, Hooks, Progress, Scheduler, doubling_epoch, longest_epoch
 from psf_cl.settings import Settings, resolve
 from psf_cl.stages import (
+    cache,
     cells,
     film,
     guide,
@@ -238,6 +239,10 @@ class Renderer:
         """Do what the paths of an epoch need that begins with pass ``start``."""
         if "guide_cells" in self.buffers:
             self._teach(start)
+        if self.freeze_cache is not None:
+            self._freeze_cache(start)
+        if "guide_cells" in self.buffers or self.freeze_cache is not None:
+            self._limit_learning(start)
         if self.chains is not None:
             is_first = start == self.scheduler.first
             self.chains.start() if is_first else self.chains.measure()
@@ -715,6 +720,7 @@ class Renderer:
             },
             "paths": self._path_statistics(counters, rays),
             "guide": self._guide_statistics(counters),
+            "cache": self._cache_statistics(counters, rays),
             "cells": self._cell_statistics(counters),
             "metropolis": self.chains.statistics() if self.chains else None,
             "photons": self.photon_map.counts() if self.photon_map else None,
@@ -751,8 +757,23 @@ class Renderer:
                 cells = self.device.read(self.buffers["guide_cells"])
                 if not guide.is_worth_it(cells, self.settings.guide_share):
                     self._guide(False, start)
+
+    def _freeze_cache(self, start: int) -> None:
+        """Let paths of the epoch of pass ``start`` end by what was gathered so far."""
+        slots = cache.slots_of(self.plan.pixel_count)
+        new_frame = start == self.scheduler.first > 0
+        if new_frame:
+            self.renew_cache(buckets_of(slots), film.GROUP)
+        fades = 0 < start <= guide.FADING_PASSES or (new_frame and self.changed)
+        self.freeze_cache.set(fades=int(fades))
+        self.freeze_cache(slots, film.GROUP)
+
+    def _limit_learning(self, start: int) -> None:
+        """Say which passes of the epoch of pass ``start`` guide and cache learn from."""
         left_out = self.guide_out is not None
-        limit = 0 if left_out else guide.learn_limit(self._epoch(start), self.plan.pixel_count)
+        learning = self.freeze_cache is not None or not left_out
+        count = self.plan.pixel_count
+        limit = guide.learn_limit(self._epoch(start), count) if learning else 0
         for name, value in (("guide_off", left_out), ("learn_limit", limit)):
             at = layout.COUNTER_INDEX[name]
             self.device.write(self.buffers["counters"], np.array([value], np.uint32), at)
@@ -788,6 +809,22 @@ class Renderer:
             "taught_cells": int(np.count_nonzero(cells["visits"] >= layout.CONSTANT["GUIDE_BINS"])),
             "failed_inserts": int(counters[layout.COUNTER_INDEX["guide_failed"]]),
             "rejected": int(counters[layout.COUNTER_INDEX["guide_rejected"]]),
+        }
+
+    def _cache_statistics(
+        self, counters: np.ndarray, rays: dict[str, int]
+    ) -> dict[str, int | float] | None:
+        if self.freeze_cache is None:
+            return None
+        keys = self.device.read(self.buffers["cache_keys"])
+        cells = self.device.read(self.buffers["cache_cells"])
+        return {
+            "cells": int(np.count_nonzero(keys)),
+            "load": float(np.count_nonzero(keys)) / len(keys),
+            "known_cells": int(np.count_nonzero(cells["visits"])),
+            "ended_paths": layout.whole(counters, "cache_ends") / max(rays["camera"], 1),
+            "failed_inserts": int(counters[layout.COUNTER_INDEX["cache_failed"]]),
+            "rejected": int(counters[layout.COUNTER_INDEX["cache_rejected"]]),
         }
 
     def _path_statistics(
@@ -954,7 +991,7 @@ class Renderer:
             "splits": settings.splits,
             "split_vertex": settings.split_vertex,
             "roulette_depth": settings.roulette_depth
-            if settings.termination == "roulette"
+            if settings.termination != "off"
             else 0xFFFFFFFF,
             "light_count": len(lights),
             "environment_light": tables.environment_light(lights),
@@ -978,6 +1015,7 @@ class Renderer:
         values |= metropolis.parameters(settings, self.plan.traits.slots, self.plan.pixel_count)
         values |= temporal.parameters(settings)
         values |= guide.parameters(scene, settings, self.plan.pixel_count, values["scene_radius"])
+        values |= cache.parameters(scene, settings, self.plan.pixel_count)
         values |= photons.parameters(settings, len(lights))
         for name, value in values.items():
             params[0][name] = value
@@ -1082,6 +1120,12 @@ class Renderer:
                 "freeze_guide", self.buffers, fades=0
             )
             self.renew_guide = programs["guide"].bind_planned("renew_guide", self.buffers)
+        self.freeze_cache: Launch | None = None
+        if "cache" in programs:
+            self.freeze_cache = programs["cache"].bind_planned(
+                "freeze_cache", self.buffers, fades=0
+            )
+            self.renew_cache = programs["cache"].bind_planned("renew_cache", self.buffers)
         self.photon_map = None
         if "photons" in programs:
             intersect = next(s for s in self.plan.stages if s.name == "intersect").kernels[0]

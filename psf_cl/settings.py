@@ -95,7 +95,22 @@ class Settings:
         "area",
         doc="how points of rectangular lights are drawn: as they are seen, or uniformly",
     )
-    termination: str = _choice("roulette", "off", doc="how paths end before max_depth")
+    termination: str = _choice(
+        "roulette",
+        "off",
+        "cache",
+        doc="how paths end before max_depth; cache: where it is known what a surface reflects",
+    )
+    cache_trace: float = _number(
+        0.0,
+        0.0,
+        1.0,
+        doc="least chance that they go on all the same, to bring the difference: unbiased; "
+        "0: the shortest paths, biased",
+    )
+    cache_cell_size: float = _number(
+        8.0, 1e-3, 1e6, doc="edge of a cell of the radiance cache, pixels"
+    )
     roulette_depth: int = _number(
         5, 0, 1 << 20, doc="bounces before Russian roulette may end a path"
     )
@@ -278,6 +293,11 @@ def check_together(settings: Settings) -> None:
     Raises:
         InputError: there are some.
     """
+    if settings.termination == "cache" and settings.path_filter != "off" and settings.cache_trace:
+        raise InputError(
+            "settings: termination=cache with a path_filter needs cache_trace=0, for averages take "
+            f"no negative light; got {settings.cache_trace}"
+        )
     if settings.integrator != "metropolis":
         return
     for key, value in METROPOLIS_NEEDS.items():
@@ -285,6 +305,8 @@ def check_together(settings: Settings) -> None:
             raise InputError(
                 f"settings: integrator=metropolis needs {key}={value}; got {getattr(settings, key)}"
             )
+    if settings.termination == "cache":
+        raise InputError("settings: integrator=metropolis goes with any termination but cache")
     if settings.light_sampling == "photon":
         raise InputError("settings: integrator=metropolis goes with any light_sampling but photon")
 

@@ -482,6 +482,7 @@ def test_plan_follows_the_options(all_features, capsys):
         "AOV_CELLS",
         "BACK_FACES",
         "BASE",
+        "CACHE",
         "CELLS",
         "FEW",
         "GUIDE",

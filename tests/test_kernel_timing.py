@@ -257,7 +257,7 @@ def full_plan():
     """Return a plan of everything but chains; what draws otherwise is on by its settings."""
     lights = (Light("point", (1.0, 1.0, 1.0)), Light("directional", (1.0, 1.0, 1.0)))
     scene = replace(small_scene(), lights=lights)
-    settings = Settings(guiding="learned", light_sampling="photon")
+    settings = Settings(guiding="learned", light_sampling="photon", termination="cache")
     return make_plan(scene, settings, AOVS, statistics=True, full=True, halves=True)
 
 
@@ -318,7 +318,7 @@ def test_the_full_build_has_every_feature_and_the_same_image(device):
         opened = Renderer(small_scene(), Settings(), narrow(device), full=full)
         on = {name for name, feature in opened.plan.features.items() if feature.value}
         # In place of something, for what is not there, or with other random numbers.
-        never = {"FEW", "METROPOLIS", "INSTANCES", "MOTION", "GUIDE", "LIGHT_SAMPLING"}
+        never = {"FEW", "METROPOLIS", "INSTANCES", "MOTION", "CACHE", "GUIDE", "LIGHT_SAMPLING"}
         assert (on == opened.plan.features.keys() - never) == full
         planned = {buffer.name: buffer.bytes for buffer in opened.plan.buffers}
         allocated = {name: buffer.bytes for name, buffer in opened.buffers.items()}

@@ -80,6 +80,9 @@
 #ifndef GUIDE
 #error "GUIDE must be 0 or 1"
 #endif
+#ifndef CACHE
+#error "CACHE must be 0 or 1 (paths end where a cell knows what a surface reflects)"
+#endif
 #ifndef CELLS
 #error "CELLS must be 0, 1 (all of a vertex's light is shared) or 2 (that of its diffuse base)"
 #endif

@@ -84,15 +84,12 @@ static inline void guide_frame(Vec3 n, Vec3 *s, Vec3 *t)
     *t = cross3(n, *s);
 }
 
-/// Find the cell of the guide that a point is in, after it was moved in its tangent plane by up to half
-/// a cell.
+/// Find the coarse cell that a point is in, after it was moved in its tangent plane by up to half a cell.
 ///
-/// The edge is a power of two of about params->guide_width times the distance to the camera.
-static inline CellKey guide_cell_of(__global const Params *params, Vec3 p, Vec3 n, UInt random)
+/// The edge is a power of two of about `width`, within the bounds of the guide's cells.
+static inline CellKey coarse_cell_of(
+    __global const Params *params, Vec3 p, Vec3 n, UInt random, Float width, uint slots)
 {
-    const Vec3 eye = vec3_of(params->camera_origin);
-    const Vec3 away = sub(p, eye);
-    const Float width = params->guide_width * sqrt(dot3(away, away));
     const Float low = (Float)(params->guide_least);
     const Float high = (Float)(params->guide_most);
     const UInt level = cell_level(clamp(width, low, high), (Float)(1.0f));
@@ -114,7 +111,7 @@ static inline CellKey guide_cell_of(__global const Params *params, Vec3 p, Vec3 
     print = mix_bits_too(print ^ y);
     print = mix_bits_too(print ^ z);
     CellKey key;
-    key.bucket = bucket_of(index, params->guide_slots);
+    key.bucket = bucket_of(index, slots);
     key.key = fingerprint(print);
     return key;
 }
@@ -127,8 +124,6 @@ typedef struct {
 } Guide;
 
 /// Find the cells of these points; those of the lanes of `learning` are made.
-///
-/// A full bucket is marked and counted: its cells are given up before the next epoch.
 static inline Guide find_guide(
     __global const Params *params,
     volatile __global uint *keys,
@@ -147,35 +142,11 @@ static inline Guide find_guide(
     g.mean = (Float)(0.0f);
     if (!any_lane(wanted))
         return g;
-    const CellKey key = guide_cell_of(params, p, n, random);
+    const Vec3 away = sub(p, vec3_of(params->camera_origin));
+    const Float width = params->guide_width * sqrt(dot3(away, away));
+    const CellKey key = coarse_cell_of(params, p, n, random, width, params->guide_slots);
     const uint size = bucket_size(params->guide_slots);
-    g.slot = find_lanes((const __global uint *)keys, full, wanted, key.bucket, size, key.key);
-    const Mask absent = wanted & (g.slot == NO_SLOT);
-    // A bucket that overflows during an epoch keeps what it knows until its end: whatever came first.
-    if (any_lane(absent)) {
-        uint lane_bucket[W];
-        uint lane_key[W];
-        uint lane_slot[W];
-        store_lanes_u(key.bucket, lane_bucket);
-        store_lanes_u(key.key, lane_key);
-        store_lanes_u(g.slot, lane_slot);
-        const uint learns = lane_bits(learning);
-        uint failed = 0;
-        for (uint left = lane_bits(absent); left; left &= left - 1u) {
-            const uint k = lowest_bit(left);
-            // Whether a lane inserts must not hang on its neighbours, which are others for another pool.
-            const uint inserts = (learns >> k) & 1u;
-            lane_slot[k] = inserts ? find_or_insert(keys, lane_bucket[k], size, lane_key[k])
-                                   : find((const __global uint *)keys, lane_bucket[k], size, lane_key[k]);
-            if (inserts && lane_slot[k] == NO_SLOT) {
-                MARK(&full[lane_bucket[k] / size]);
-                ++failed;
-            }
-        }
-        if (failed != 0u)
-            atomic_add(&counters[COUNTER_GUIDE_FAILED], failed);
-        g.slot = load_lanes_u(lane_slot);
-    }
+    g.slot = find_or_make(keys, full, &counters[COUNTER_GUIDE_FAILED], wanted, learning, key.bucket, size, key.key);
     const Mask there = g.slot != NO_SLOT;
     const UInt at = pick_u(there, g.slot, (UInt)(0u));
     g.mean = pick(there, GATHER(cells, at, mean), (Float)(0.0f));

@@ -110,6 +110,48 @@ static inline UInt find_lanes(
     return slot;
 }
 
+/// Slots of the keys of the lanes in `wanted`; those of `making` are claimed where they were not there.
+///
+/// A full bucket is marked, and the keys that it had no room for are added to `failed`.  It keeps what it
+/// has until somebody gives it up: whatever came first.
+static inline UInt find_or_make(
+    volatile __global uint *keys,
+    __global uint *full_buckets,
+    volatile __global uint *failed,
+    Mask wanted,
+    Mask making,
+    UInt bucket,
+    uint size,
+    UInt key)
+{
+    UInt slot = find_lanes((const __global uint *)keys, full_buckets, wanted, bucket, size, key);
+    const Mask absent = wanted & (slot == NO_SLOT);
+    if (!any_lane(absent))
+        return slot;
+    uint lane_bucket[W];
+    uint lane_key[W];
+    uint lane_slot[W];
+    store_lanes_u(bucket, lane_bucket);
+    store_lanes_u(key, lane_key);
+    store_lanes_u(slot, lane_slot);
+    const uint makes = lane_bits(making);
+    uint without = 0;
+    for (uint left = lane_bits(absent); left; left &= left - 1u) {
+        const uint k = lowest_bit(left);
+        // Whether a lane inserts must not hang on its neighbours, which are others for another pool.
+        const uint inserts = (makes >> k) & 1u;
+        lane_slot[k] = inserts ? find_or_insert(keys, lane_bucket[k], size, lane_key[k])
+                               : find((const __global uint *)keys, lane_bucket[k], size, lane_key[k]);
+        if (inserts && lane_slot[k] == NO_SLOT) {
+            MARK(&full_buckets[lane_bucket[k] / size]);
+            ++without;
+        }
+    }
+    if (without != 0u)
+        atomic_add(failed, without);
+    return load_lanes_u(lane_slot);
+}
+
 /// Whether no slot of a bucket is taken.
 static inline int bucket_is_empty(const __global uint *keys, uint size)
 {

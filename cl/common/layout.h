@@ -163,16 +163,28 @@
 #else
 #define PATH_END_7 PATH_END_6
 #endif
-#if GUIDE >= 1
-#define PATH_GUIDE (PATH_END_7 + 0u) // uint; part of the guide's cell that the ray left through; NO_PART: none
-#define PATH_GUIDE_FROM (PATH_END_7 + 1u) // uint; that of the ray before the shadow ray
-#define PATH_EXPECTED (PATH_END_7 + 2u) // luminance at the camera that the first vertex was expected to reflect
-#define PATH_GUIDE_LIGHT (PATH_END_7 + 3u) // luminance that arrives through the shadow ray, reflected along that
-#define PATH_END_8 (PATH_END_7 + 4u)
+#if CACHE >= 1
+#define PATH_CACHE (PATH_END_7 + 0u) // uint; cell that the path learns for; NO_SLOT: none
+#define PATH_CACHE_GATE_R (PATH_END_7 + 1u) // part of light from here that it reflects, over its reflectance
+#define PATH_CACHE_GATE_G (PATH_END_7 + 2u)
+#define PATH_CACHE_GATE_B (PATH_END_7 + 3u)
+#define PATH_CACHE_LIGHT_R (PATH_END_7 + 4u) // what arrives through the shadow ray, by the same measure
+#define PATH_CACHE_LIGHT_G (PATH_END_7 + 5u)
+#define PATH_CACHE_LIGHT_B (PATH_END_7 + 6u)
+#define PATH_END_8 (PATH_END_7 + 7u)
 #else
 #define PATH_END_8 PATH_END_7
 #endif
-#define PATH_FIELD_COUNT PATH_END_8
+#if GUIDE >= 1
+#define PATH_GUIDE (PATH_END_8 + 0u) // uint; part of the guide's cell that the ray left through; NO_PART: none
+#define PATH_GUIDE_FROM (PATH_END_8 + 1u) // uint; that of the ray before the shadow ray
+#define PATH_EXPECTED (PATH_END_8 + 2u) // luminance at the camera that the first vertex was expected to reflect
+#define PATH_GUIDE_LIGHT (PATH_END_8 + 3u) // luminance that arrives through the shadow ray, reflected along that
+#define PATH_END_9 (PATH_END_8 + 4u)
+#else
+#define PATH_END_9 PATH_END_8
+#endif
+#define PATH_FIELD_COUNT PATH_END_9
 
 #define CHAIN_KNOWN 0u // uint; pairs of numbers of the state from which the path starts; 0: a large step
 #define CHAIN_PAIRS 1u // uint; pairs of numbers that the state has
@@ -220,10 +232,14 @@
 #define COUNTER_GUIDE_REJECTED 26u // what is not finite, or too large for the sums of the guide
 #define COUNTER_GUIDE_OFF 27u // 1 if the guide does not pay here, and is left out; set by the host
 #define COUNTER_LEARN_LIMIT 28u // first pass that the guide learns nothing from; set by the host
-#define COUNTER_PENDING_CAMERA 29u // rays since the last film launch
-#define COUNTER_PENDING_BOUNCE 30u
-#define COUNTER_PENDING_SHADOW 31u
-#define COUNTER_FINISHED 32u // first of the ring: samples done of each pass in flight
+#define COUNTER_CACHE_FAILED 29u // vertices that found their part of the table of the radiance cache full
+#define COUNTER_CACHE_REJECTED 30u // what is not finite, or too large for the sums of the radiance cache
+#define COUNTER_CACHE_ENDS 31u // low word; paths that ended by the radiance cache
+#define COUNTER_CACHE_ENDS_HIGH 32u // high word
+#define COUNTER_PENDING_CAMERA 33u // rays since the last film launch
+#define COUNTER_PENDING_BOUNCE 34u
+#define COUNTER_PENDING_SHADOW 35u
+#define COUNTER_FINISHED 36u // first of the ring: samples done of each pass in flight
 
 #define PHOTONS_EMITTED 0u // with any power
 #define PHOTONS_DARK 1u // drawn where their light gives none
@@ -307,6 +323,12 @@ typedef struct {
     float guide_share; // of the directions of a diffuse lobe that the guide draws
     float guide_steps; // fixed-point steps of a sum of its radiance per unit, a power of two
     float guide_limit; // radiance from which a sample is too large for these sums
+    uint cache_slots; // of the table of the radiance cache, a power of two
+    float cache_width; // edge of its cells, m per m from the camera
+    float cache_steps; // fixed-point steps of a sum of radiance per unit, a power of two
+    float cache_limit; // radiance from which a sample is too large for these sums
+    float cache_trace; // least chance that a path goes on where a cell is known
+    uint pad[3]; // fills the record
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.
@@ -655,6 +677,22 @@ typedef struct {
     uint high[3]; // of radiance
     uint pad[2]; // fills the record
 } SplatSum;
+
+/// What a cell of the radiance cache gathers: 64-bit fixed-point sums.
+typedef struct {
+    uint low[4]; // of rgb over the reflectance; of the squared luminance over the mean
+    uint high[4]; // of the same
+    uint count; // visits
+    uint pad[3]; // fills the record
+} CacheSum;
+
+/// What a cell of the radiance cache knows, the same for a whole epoch.
+typedef struct {
+    float mean[3]; // radiance that a white diffuse surface reflects there
+    float ends; // chance that a path ends there
+    float visits; // that it is made from; 0: nothing is known
+    float pad[3]; // fills the record
+} CacheCell;
 
 /// What a cell of the guide gathers: 64-bit fixed-point sums of each part of the hemisphere.
 typedef struct {

@@ -141,6 +141,11 @@ PARAMS = Record(
     float guide_share - of the directions of a diffuse lobe that the guide draws
     float guide_steps - fixed-point steps of a sum of its radiance per unit, a power of two
     float guide_limit - radiance from which a sample is too large for these sums
+    uint cache_slots - of the table of the radiance cache, a power of two
+    float cache_width - edge of its cells, m per m from the camera
+    float cache_steps - fixed-point steps of a sum of radiance per unit, a power of two
+    float cache_limit - radiance from which a sample is too large for these sums
+    float cache_trace - least chance that a path goes on where a cell is known
     """),
 )
 
@@ -590,6 +595,28 @@ SPLAT_SUM = Record(
     """),
 )
 
+CACHE_SUM = Record(
+    "CacheSum",
+    "What a cell of the radiance cache gathers: 64-bit fixed-point sums.",
+    _fields("""
+    uint low[4] - of rgb over the reflectance; of the squared luminance over the mean
+    uint high[4] - of the same
+    uint count - visits
+    uint pad[3] - fills the record
+    """),
+)
+
+CACHE_CELL = Record(
+    "CacheCell",
+    "What a cell of the radiance cache knows, the same for a whole epoch.",
+    _fields("""
+    float mean[3] - radiance that a white diffuse surface reflects there
+    float ends - chance that a path ends there
+    float visits - that it is made from; 0: nothing is known
+    float pad[3] - fills the record
+    """),
+)
+
 #: Parts of the hemisphere that the guide tells apart, a side of the square.
 GUIDE_SIDE = 8
 
@@ -650,6 +677,8 @@ RECORDS = (
     CELL_SQUARES,
     CELL_VIEW,
     SPLAT_SUM,
+    CACHE_SUM,
+    CACHE_CELL,
     GUIDE_SUM,
     GUIDE_CELL,
 )
@@ -761,6 +790,19 @@ OPTIONAL_PATH_FIELDS = (
         ),
     ),
     (
+        "CACHE",
+        1,
+        (
+            ("cache", "uint; cell that the path learns for; NO_SLOT: none"),
+            ("cache_gate_r", "part of light from here that it reflects, over its reflectance"),
+            ("cache_gate_g", ""),
+            ("cache_gate_b", ""),
+            ("cache_light_r", "what arrives through the shadow ray, by the same measure"),
+            ("cache_light_g", ""),
+            ("cache_light_b", ""),
+        ),
+    ),
+    (
         "GUIDE",
         1,
         (
@@ -833,6 +875,10 @@ COUNTERS = (
     ("guide_rejected", "what is not finite, or too large for the sums of the guide"),
     ("guide_off", "1 if the guide does not pay here, and is left out; set by the host"),
     ("learn_limit", "first pass that the guide learns nothing from; set by the host"),
+    ("cache_failed", "vertices that found their part of the table of the radiance cache full"),
+    ("cache_rejected", "what is not finite, or too large for the sums of the radiance cache"),
+    ("cache_ends", "low word; paths that ended by the radiance cache"),
+    ("cache_ends_high", "high word"),
     ("pending_camera", "rays since the last film launch"),
     ("pending_bounce", ""),
     ("pending_shadow", ""),

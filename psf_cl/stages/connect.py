@@ -21,6 +21,8 @@ def plan(context: Context) -> StageSpec | None:
     # What blends by chance has random numbers of its path.
     numbers = ("seed", "sample", "status") if context.features["ALPHA"].value == 2 else ()
     learned = ("guide_from", "guide_light") if context.on("GUIDE") else ()
+    if context.on("CACHE"):
+        learned += ("cache", "cache_light")
     if learned:
         numbers = ("seed", "sample", "status")
     reads = (

@@ -70,11 +70,14 @@ def _kernel(context: Context) -> KernelSpec:
     chosen: tuple[str, ...] = ("light_normal",) if context.on("LIGHT_SAMPLING") else ()
     if context.features["LIGHT_SAMPLING"].value >= 2:
         chosen += ("particle_row",)
+    cached = ("cache", "cache_gate") if context.on("CACHE") else ()
+    if cached and shadow:
+        shadow += ("cache_light",)
     guided = ("guide", "expected") if context.on("GUIDE") else ()
     if guided and shadow:
         shadow += ("guide_from", "guide_light")
     walk = ("status", "direction", "beta", "radiance", "pdf")
-    walk += (*direct, *base, *shared, *chosen, *guided)
+    walk += (*direct, *base, *shared, *chosen, *cached, *guided)
     walk += ("denser",) if context.on("TRANSMISSION") else ()
     records = [layout.SURFACE, layout.MATERIAL]
     if context.on("INSTANCES"):
@@ -99,11 +102,13 @@ def _kernel(context: Context) -> KernelSpec:
         records.append(layout.SEEN)
     # Of the guide, its key, the words that a drawing looks at, and a sum and a count.
     guide_bytes = 4 * (1 + 2 + 4 + 8 + 2 + 3) if context.on("GUIDE") else 0
+    if context.on("CACHE"):
+        records += [layout.CACHE_CELL, layout.CACHE_SUM]
     feature_bytes = 3 * 16 if context.on("AOV_FEATURES") else 0
     return KernelSpec(
         "shade_paths",
         reads=(*walk, *(("origin",) if chosen else ()), "hit", "sample", "pixel", "seed"),
         writes=(*walk, "origin", *shadow),
         record_bytes=sum(record.dtype.itemsize for record in records) + feature_bytes + guide_bytes,
-        hash_accesses=int(context.on("GUIDE")),
+        hash_accesses=int(context.on("GUIDE")) + int(context.on("CACHE")),
     )
