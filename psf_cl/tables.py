@@ -457,6 +457,16 @@ RECTANGLE_SLACK = 1e-5
 MOST_IN_RECTANGLES = 4096
 
 
+def _lights_move(scene: Scene) -> bool:
+    """Return whether the table of lights is another one at another time."""
+    glow = any(material.emission_curve is not None for material in scene.materials)
+    return (
+        bool(scene.nodes)
+        or glow
+        or any(light.intensity_curve is not None for light in scene.lights)
+    )
+
+
 def _rectangles(scene: Scene, surfaces: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Return ``(n,)`` bool: which of the ``triangles`` make a rectangle with the next one.
 
@@ -468,10 +478,9 @@ def _rectangles(scene: Scene, surfaces: np.ndarray, triangles: np.ndarray) -> np
         triangles: ``(n,)`` indices of those that emit, ascending.
     """
     whole = np.zeros(len(triangles), bool)
-    if scene.nodes or not 2 <= len(triangles) <= MOST_IN_RECTANGLES:
+    if _lights_move(scene) or not 2 <= len(triangles) <= MOST_IN_RECTANGLES:
         return whole
     even = np.array([m.alpha_mode == "opaque" and m.emission_texture < 0 for m in scene.materials])
-    even &= [m.emission_curve is None for m in scene.materials]
     a, b = surfaces[triangles[:-1]], surfaces[triangles[1:]]
     together = (a["shape"] == b["shape"]) & (triangles[1:] == triangles[:-1] + 1)
     together &= even[a["material"]] & ((a["ng"] * b["ng"]).sum(axis=1) > 0.999)
@@ -507,7 +516,8 @@ def count_rectangles(scene: Scene) -> int:
     shapes = tuple(
         shape for shape in visible_shapes(scene) if emits(scene.materials[shape.material])
     )
-    if scene.nodes or sum(len(shape.mesh.triangles) for shape in shapes) > MOST_IN_RECTANGLES:
+    count = sum(len(shape.mesh.triangles) for shape in shapes)
+    if _lights_move(scene) or count > MOST_IN_RECTANGLES:
         return 0
     surfaces = flatten(replace(scene, shapes=shapes)).surfaces
     return int(_rectangles(scene, surfaces, np.arange(len(surfaces))).sum())
