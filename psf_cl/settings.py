@@ -91,9 +91,9 @@ class Settings:
         "mis", "light", "bsdf", doc="direct light by both strategies, or by one of them alone"
     )
     area_sampling: str = _choice(
-        "solid_angle",
         "area",
-        doc="how points of rectangular lights are drawn: as they are seen, or uniformly",
+        "solid_angle",
+        doc="how points of rectangular lights are drawn: uniformly, or as they are seen",
     )
     termination: str = _choice(
         "roulette",

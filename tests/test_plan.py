@@ -261,6 +261,9 @@ def test_every_flag_at_once_renders(wants):
         temporal="adaptive",
         light_sampling="hierarchy",
         guiding="learned",
+        cell_min_count=2,
+        termination="cache",
+        area_sampling="solid_angle",
     )
     # Chains of paths would leave out what samples of pixels are for, places the list of triangles.
     off = {name for name, feature in opened.plan.features.items() if not feature.value}

@@ -119,8 +119,11 @@ def test_only_what_is_a_rectangle_and_glows_evenly_is_one():
         assert tables.count_rectangles(scene) == expected
 
 
+SOLID = Settings(area_sampling="solid_angle")
+
+
 def test_the_plan_says_whether_there_are_rectangles():
-    found = make_plan(under_a_lamp(), Settings()).features["RECTANGLES"]
+    found = make_plan(under_a_lamp(), SOLID).features["RECTANGLES"]
     assert found.value == 1 and found.reason.startswith("1 lights are rectangles")
     left = make_plan(under_a_lamp(), Settings(area_sampling="area")).features["RECTANGLES"]
     assert (left.value, left.reason) == (0, "area_sampling is area")
@@ -151,5 +154,6 @@ def test_rectangles_among_others_are_drawn_from_the_tree_too(device, way):
     shape = dataclasses.replace(scene.shapes[1], transform=lamp)
     scene = dataclasses.replace(scene, shapes=(*scene.shapes, shape))
     truth = render(device, scene, 4096, max_depth=2, direct_sampling="bsdf").rgb
-    image = render(device, scene, 1024, max_depth=2, direct_sampling="light", light_sampling=way)
+    ways = {"area_sampling": "solid_angle", "direct_sampling": "light", "light_sampling": way}
+    image = render(device, scene, 1024, max_depth=2, **ways)
     assert image.rgb.mean() == pytest.approx(truth.mean(), rel=0.01)

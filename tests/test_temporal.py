@@ -225,11 +225,12 @@ def test_probes_find_how_much_of_the_light_has_changed(device):
         render(device, room(size, factor=factor), 128).rgb.mean(axis=-1) for factor in (1.0, 0.0)
     )
     found, truth = images[1].aovs["gradient"][..., 0], 1 - off / on
-    # Means over a few probes, and over their surroundings.
-    for low, high in ((0.1, 0.2), (0.2, 0.4), (0.4, 0.7)):
+    # Means over a few probes, and over their surroundings; above a half all counts as changed,
+    # which is up to 0.15 more in the last range.
+    for low, high, most in ((0.1, 0.2, 0.1), (0.2, 0.4, 0.1), (0.4, 0.7, 0.15)):
         some = (truth > low) & (truth < high)
         assert some.sum() > 100
-        assert found[some].mean() == pytest.approx(truth[some].mean(), abs=0.1)
+        assert found[some].mean() == pytest.approx(truth[some].mean(), abs=most)
     assert np.median(found[np.abs(truth) < 0.01]) < 0.02
 
 

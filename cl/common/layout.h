@@ -659,6 +659,7 @@ typedef struct {
 typedef struct {
     uint low; // of (luminance / cell_limit)^2; from resolve_cells on a float's bits: the variance
     uint high; // of the same
+    uint unused[2]; // fills 16 bytes
 } CellSquares;
 
 /// What the samples of a pixel saw of cells: sums over its samples.

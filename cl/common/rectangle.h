@@ -11,6 +11,8 @@
 
 // Below this solid angle floats would show.
 #define LEAST_SOLID_ANGLE 1e-2f
+// Above the plane, in sides.
+#define LEAST_HEIGHT 1e-4f
 
 /// A rectangle from a point at the origin: its sides at `x0`, `x1` and `y0`, `y1` of its plane at `z` >= 0.
 typedef struct {
@@ -56,8 +58,13 @@ static inline SeenRectangle see_rectangle(Vec3 corner, Vec3 e1, Vec3 e2, Vec3 fr
     return r;
 }
 
-/// Whether it is large enough for directions to be drawn uniformly; no solid angle that is no number is.
-static inline Mask is_wide(SeenRectangle r) { return (r.solid > LEAST_SOLID_ANGLE) & (r.solid < INFINITY); }
+/// Whether it is large enough for directions to be drawn uniformly, and far enough from its plane for points on
+/// it to be told apart; no solid angle that is no number is.
+static inline Mask is_wide(SeenRectangle r)
+{
+    const Mask apart = r.z > LEAST_HEIGHT * max(r.x1 - r.x0, r.y1 - r.y0);
+    return apart & (r.solid > LEAST_SOLID_ANGLE) & (r.solid < INFINITY);
+}
 
 /// Draw a point, as parts of the edges, so that directions are uniform.
 static inline void sample_rectangle(SeenRectangle r, Float u1, Float u2, Float *part1, Float *part2)

@@ -569,6 +569,7 @@ CELL_SQUARES = Record(
     _fields("""
     uint low - of (luminance / cell_limit)^2; from resolve_cells on a float's bits: the variance
     uint high - of the same
+    uint unused[2] - fills 16 bytes
     """),
 )
 

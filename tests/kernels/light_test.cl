@@ -37,7 +37,7 @@ kernel void sample_lights(
     LightQuery query;
     query.p = LOAD_V(origin, 0);
     query.n = query.p;
-    const LightChoice light = choose_light(params, lights, LOAD_U(active, 0) != 0u, &query, choice);
+    const LightChoice light = choose_light(params, lights, LOAD_U(active, 0) != 0u, query, choice);
     const LightSample s = sample_light(params, lights, surfaces, materials,
 #if TEXTURES
                                        uvs, textures, texels, srgb_to_linear,
