@@ -732,8 +732,9 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     full["FEW"] = Feature(0, f"a tree for measuring, though {features['FEW'].reason}")
     # Neither are there places of what is there once.
     full["INSTANCES"] = features["INSTANCES"]
-    # Other lights would be drawn: another image.
+    # Other lights would be drawn, or other points of them: another image.
     full["LIGHT_SAMPLING"] = features["LIGHT_SAMPLING"]
+    full["RECTANGLES"] = features["RECTANGLES"]
     # Chains are another integrator, which has no images beside the one.
     full["METROPOLIS"] = features["METROPOLIS"]
     # Directions would be drawn otherwise: the image would have other noise.
