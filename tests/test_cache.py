@@ -9,13 +9,12 @@ import pytest
 from scene_builder import (
     build,
     camera,
-    floor,
     glowing,
-    lambertian,
     luminance_blocks,
     render,
     z_scores,
 )
+from test_guide import noisy, room
 
 from psf_cl.device import layout
 from psf_cl.device.device import Device
@@ -30,32 +29,10 @@ CACHE = {"termination": "cache"}
 STEPS = 64.0
 
 
-def room(size=(24, 16)):
-    """Return a lamp behind a wall that lights a floor around the corner."""
-    wall = transform.translation((0, 0.6, 0)) @ transform.rotation_xyz_degrees((90, 0, 0))
-    lamp = transform.translation((0, 1.4, -1.5)) @ transform.rotation_xyz_degrees((180, 0, 0))
-    back = transform.translation((0, 1.5, -2.5)) @ transform.rotation_xyz_degrees((90, 0, 0))
-    return build(
-        [
-            floor(3.0, lambertian((0.7, 0.5, 0.3))),
-            (primitives.quad(), wall @ transform.scaling(1.2), lambertian((0.3, 0.6, 0.8))),
-            (primitives.quad(), back @ transform.scaling(3.0), lambertian((0.8, 0.8, 0.8))),
-            (primitives.quad(), lamp @ transform.scaling(0.2), glowing((40.0, 30.0, 20.0))),
-        ],
-        camera((0, 1.5, 3), (0, 0.5, 0), 45),
-        size,
-    )
-
-
 @pytest.fixture(scope="module")
 def small(device):
     """Return the device with a small pool, so that epochs are short."""
     return Device(device.context, replace(device.traits, slots=1024))
-
-
-def noisy(device, spp, **settings):
-    """Return an image of independent samples with their variance."""
-    return render(device, room(), spp, outputs=("variance",), sampler="random", **settings)
 
 
 @pytest.fixture(scope="module")

@@ -232,16 +232,21 @@ def many_kinds():
     return build(parts, view, (16, 16), lights=lights, environment=0.3)
 
 
-@pytest.mark.parametrize("sampling", ["mis", pytest.param("light", marks=pytest.mark.slow)])
-def test_image_is_the_same_as_with_a_table(device, sampling):
-    scene = many_kinds()
+def check_against_table(device, way, sampling):
+    """Compare a choice of lights with that by power; return both images of ``many_kinds``."""
     common = {"sampler": "random", "max_depth": 3, "direct_sampling": sampling}
     common["outputs"] = ["variance"]
-    tree = render(device, scene, 256, light_sampling="hierarchy", **common)
-    table = render(device, scene, 1024, light_sampling="power", seed=1, **common)
-    z = z_scores(tree, table, 4)
+    image = render(device, many_kinds(), 256, light_sampling=way, **common)
+    table = render(device, many_kinds(), 1024, light_sampling="power", seed=1, **common)
+    z = z_scores(image, table, 4)
     assert np.abs(z).max() < 4.0
     assert stats.chi2.sf((z**2).sum(), z.size) > 1e-4
+    return image, table
+
+
+@pytest.mark.parametrize("sampling", ["mis", pytest.param("light", marks=pytest.mark.slow)])
+def test_image_is_the_same_as_with_a_table(device, sampling):
+    tree, table = check_against_table(device, "hierarchy", sampling)
     noise = [np.mean(image.aovs["variance"]) * image.stats["spp"] for image in (tree, table)]
     assert noise[0] < noise[1]
     assert (tree.rgb @ LUMINANCE).mean() > 0.1

@@ -6,7 +6,7 @@ import pytest
 from scene_builder import build, camera, floor, glowing, inside_out, lambertian, render, z_scores
 from scene_builder import renderer as open_renderer
 from scipy import stats
-from test_light_tree import many_kinds
+from test_light_tree import check_against_table, many_kinds
 
 from psf_cl.device import layout
 from psf_cl.plan import MANY_LIGHTS, make_plan
@@ -82,14 +82,7 @@ def test_the_same_photons_leave_the_same_map_and_the_same_image(device, opened):
 
 @pytest.mark.parametrize("sampling", ["mis", pytest.param("light", marks=pytest.mark.slow)])
 def test_image_is_the_same_as_with_a_table(device, sampling):
-    scene = many_kinds()
-    common = {"sampler": "random", "max_depth": 3, "direct_sampling": sampling}
-    common["outputs"] = ["variance"]
-    guided = render(device, scene, 256, light_sampling="photon", **common)
-    table = render(device, scene, 1024, light_sampling="power", seed=1, **common)
-    z = z_scores(guided, table, 4)
-    assert np.abs(z).max() < 4.0
-    assert stats.chi2.sf((z**2).sum(), z.size) > 1e-4
+    guided, _ = check_against_table(device, "photon", sampling)
     counts = guided.stats["photons"]
     assert counts["emitted"] == counts["stored"] + counts["escaped"] > 0
     assert counts["escaped"] > 0  # The sky's photons go past the floor, too.

@@ -245,9 +245,7 @@
 #define PHOTONS_DARK 1u // drawn where their light gives none
 #define PHOTONS_ESCAPED 2u // left the scene
 #define PHOTONS_STORED 3u // deposits in the map
-#define PHOTONS_ABSORBED 4u // ended at a surface
-#define PHOTONS_CUT 5u // ended by the limit of bounces
-#define PHOTONS_REJECTED 6u // with a power that is not finite
+#define PHOTONS_REJECTED 4u // with a power that is not finite
 
 /// Everything that is the same for all paths of a render.
 typedef struct {

@@ -840,8 +840,6 @@ PHOTON_COUNTERS = (
     ("dark", "drawn where their light gives none"),
     ("escaped", "left the scene"),
     ("stored", "deposits in the map"),
-    ("absorbed", "ended at a surface"),
-    ("cut", "ended by the limit of bounces"),
     ("rejected", "with a power that is not finite"),
 )
 
