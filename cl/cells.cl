@@ -285,13 +285,13 @@ static inline void view_cell(
     const uint bucket = slot & ~(size - 1u);
     uint taken = 0;
     for (uint i = 0; i < size; ++i)
-        taken += keys[bucket + i] != 0u;
+        taken += LOOK(&keys[bucket + i]) != 0u;
     view->occupancy += (float)taken / (float)size;
-    view->count += (float)cells[slot].count;
+    view->count += (float)LOOK(&cells[slot].count);
     view->variance += as_float(squares[slot].low);
     view->weight += 1.0f;
     // The slot with the key, for keys of different buckets may be the same.
-    uint bits = keys[slot] * 0x9e3779b9u + slot * 0x85ebca77u;
+    uint bits = LOOK(&keys[slot]) * 0x9e3779b9u + slot * 0x85ebca77u;
     for (uint c = 0; is_first && c < 3; ++c) {
         bits = (bits ^ (bits >> 15)) * 0x2c1b3c6du;
         view->color[c] = (float)(bits >> 8) * 5.9604645e-8f;

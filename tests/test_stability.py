@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 from scene_builder import build, camera, floor, glowing, inside_out, lambertian, render, renderer
 
+from psf_cl.plan import make_plan
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.animation import world_transforms
 from psf_cl.scene.curve import Curve
 from psf_cl.scene.far import far_from_origin, moved
 from psf_cl.scene.model import Material, Node, Skin, View
-from psf_cl.settings import PRESETS
+from psf_cl.settings import PRESETS, resolve
 
 ROOT = Path(__file__).resolve().parents[1]
 VIEW = camera((0.0, 0.0, 0.95), (0.0, -0.2, -1.0), 60.0)
@@ -193,6 +194,15 @@ def test_the_table_tells_good_from_bad(tool, device, monkeypatch, tmp_path, caps
     assert "FAILED,the mean is off," in wrong and "max_depth must be from 0" in refused
     page = (tmp_path / "stability.html").read_text()
     assert page.count("<tr") == 4 and page.count("class=failed") == 2
+
+
+def test_jobs_of_the_simulator_are_renders_that_are_not_refused(tool):
+    jobs = importlib.import_module("check_kernels")
+    for name, job in jobs.JOBS.items():
+        settings = resolve({}, name, job.preset, jobs.SMALL | dict(job.settings))
+        outputs = (jobs.OUTPUTS if job.everything else ()) + job.outputs
+        plan = make_plan(job.scene(jobs.EDGE), settings, outputs, halves=job.everything)
+        assert plan.stages
 
 
 @pytest.mark.slow

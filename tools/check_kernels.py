@@ -125,7 +125,8 @@ class Job:
     Attributes:
         tree: whether triangles are in a tree; else they are a list.
         times: of the frames after the first, s.
-        everything: with all outputs and statistics, and a look at the first pass before its end.
+        everything: with outputs and statistics, and a look at the first pass before its end.
+        outputs: more outputs.
     """
 
     scene: Callable[[int], Scene]
@@ -134,7 +135,11 @@ class Job:
     tree: bool = True
     times: tuple[float, ...] = ()
     everything: bool = False
+    outputs: tuple[str, ...] = ()
 
+
+OUTPUTS = ("albedo", "normal", "depth", "direct", "indirect", "variance", "samples", "motion")
+OUTPUTS_OF_CELLS = ("cells", "occupancy", "cell_count", "cell_variance", "filter_weight")
 
 JOBS = {
     **{f"{preset}, tree": Job(room, preset) for preset in PRESETS},
@@ -144,19 +149,21 @@ JOBS = {
     "exponential": Job(room_that_moves, "pt", {"temporal": "exponential"}, False, (1.0,)),
     "instances": Job(instances, "psf"),
     "hierarchy": Job(everything, "pt", {"light_sampling": "hierarchy"}, tree=False),
-    "photons over power": Job(room, "photon", {"photon_over": "power"}),
+    "cache": Job(room_that_moves, "pt", {"termination": "cache"}, times=(1.0,)),
+    "rectangles": Job(room, "pt", {"area_sampling": "solid_angle"}, tree=False),
     "range search": Job(
         room, "psf", {"path_filter": "range_search", "filter_restore": False}, everything=True
     ),
-    "outputs": Job(everything, "psf", tree=False, everything=True),
+    "outputs": Job(everything, "psf", {"filter_restore": False}, tree=False, everything=True),
+    "outputs of cells": Job(room, "psf", {"cell_min_count": 4}, outputs=OUTPUTS_OF_CELLS),
+    "screen filter": Job(room, "pt", {"screen_filter": "path_space"}, tree=False),
     "splits": Job(room, "pt", {"splits": 2, "sampler": "random", "direct_sampling": "bsdf"}),
 }
-
-OUTPUTS = ("albedo", "normal", "depth", "direct", "indirect", "variance", "samples", "motion")
 
 #: Tables that are large whatever the scene, made small: simulators are slow.
 SMALL_TABLES = (
     (psf_cl.stages.guide, "LEAST_SLOTS", 64),
+    (psf_cl.stages.cache, "LEAST_SLOTS", 64),
     (psf_cl.stages.photons, "CELLS", 64),
     (psf_cl.stages.metropolis, "CANDIDATES", 256),
     (psf_cl.stages.metropolis, "MUTATIONS_PER_EPOCH", 4),
@@ -206,13 +213,13 @@ def render(job: Job, lanes: int) -> set[str]:
         scene,
         settings,
         device,
-        OUTPUTS if job.everything else (),
+        (OUTPUTS if job.everything else ()) + job.outputs,
         statistics=job.everything,
         halves=job.everything,
     )
     with contextlib.closing(renderer):
         if job.everything:
-            renderer.step()
+            renderer.render(spp=1, progress=lambda now: False)
             renderer.image()
         renderer.render(spp=2)
         for time in job.times:

@@ -216,7 +216,7 @@ static inline uint claim_lanes(
         firsts |= 1u << i;
         lane_slot[i] = find_or_insert(keys, lane_bucket[i], size, lane_key[i]);
         if (lane_slot[i] != NO_SLOT)
-            (void)cells[lane_slot[i]].count;
+            (void)LOOK(&cells[lane_slot[i]].count);
     }
     return firsts;
 }

@@ -36,9 +36,6 @@ if TYPE_CHECKING:
     from psf_cl.device.device import Device
     from psf_cl.renderer import Progress
 
-#: What a command is given in place of these words.
-PLACEHOLDERS = "{scene} {out} {seconds} or {spp} {seed} {width} {height} {stats}"
-
 #: A budget so short that a renderer stops after its first pass.
 FIRST_PASS_SECONDS = 0.001
 
