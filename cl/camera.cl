@@ -29,6 +29,9 @@ static inline uint regenerate(
 #if AOV_DIRECT
     __global float *direct,
 #endif
+#if AOV_BOUNCES
+    __global float *bounces,
+#endif
 #if BASE
     __global float *base,
 #endif
@@ -84,6 +87,10 @@ static inline uint regenerate(
         store_lanes(direct_part.y, lane_direct[1]);
         store_lanes(direct_part.z, lane_direct[2]);
 #endif
+#if AOV_BOUNCES
+        float lane_bounces[W];
+        store_lanes(to_float(status & DEPTH_MASK), lane_bounces);
+#endif
 #if BASE
         base_part = pick_v(bad, black, base_part);
         float lane_base[3][W];
@@ -106,6 +113,9 @@ static inline uint regenerate(
             vstore4((float4)(lane_value[0][k], lane_value[1][k], lane_value[2][k], 1.0f), at, samples);
 #if AOV_DIRECT
             vstore4((float4)(lane_direct[0][k], lane_direct[1][k], lane_direct[2][k], 1.0f), at, direct);
+#endif
+#if AOV_BOUNCES
+            vstore4((float4)(lane_bounces[k], 0.0f, 0.0f, 1.0f), at, bounces);
 #endif
 #if BASE
             vstore4((float4)(lane_base[0][k], lane_base[1][k], lane_base[2][k], 1.0f), at, base);
@@ -187,7 +197,7 @@ static inline uint regenerate(
 /// A sample that is not finite, or too large to be summed, is handed in as black and counted.
 ///
 /// reads   pool, counters
-/// writes  pool; samples (direct, base, beyond) of finished paths; counters.{next_pixel, finished[],
+/// writes  pool; samples (direct, bounces, base, beyond) of finished paths; counters.{next_pixel, finished[],
 ///         rejected_samples, pending_camera}
 kernel void regenerate_paths(
     __global const Params *params,
@@ -195,6 +205,9 @@ kernel void regenerate_paths(
     volatile __global uint *counters,
 #if AOV_DIRECT
     __global float *direct,
+#endif
+#if AOV_BOUNCES
+    __global float *bounces,
 #endif
 #if BASE
     __global float *base,
@@ -219,6 +232,9 @@ kernel void regenerate_paths(
         claimed = regenerate(params, pool_at(pool, item), claimed, &tally, counters,
 #if AOV_DIRECT
                              direct,
+#endif
+#if AOV_BOUNCES
+                             bounces,
 #endif
 #if BASE
                              base,

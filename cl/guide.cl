@@ -3,6 +3,7 @@
 #include "common/features.h"
 #include "common/layout.h"
 #include "common/hash_map.h"
+#include "common/guide.h"
 
 // Visits that what is known of the square around is worth.
 #define TRUST 8.0f
@@ -119,3 +120,81 @@ kernel void freeze_guide(
             sums->count[k] >>= 1;
         }
 }
+
+#if AOV_GUIDE
+// Look-ups around what a pixel sees, whose mean is shown.
+#define VIEW_LOOKS 8u
+
+/// Tell what the guide knows where the pixels look, on average over the cells that look-ups may find there.
+/// One work item W pixels.
+///
+/// reads   surfaces_seen, guide_keys, guide_full, guide_cells
+/// writes  guide_views
+kernel void view_guide(
+    __global const Params *params,
+    __global const SeenMean *surfaces_seen,
+    __global const uint *guide_keys,
+    __global const uint *guide_full,
+    __global const GuideCell *guide_cells,
+    __global GuideView *guide_views)
+{
+    const uint first = get_global_id(0) * W;
+    if (first >= params->pixel_count)
+        return;
+    const UInt pixel = min(lanes_before(MASK_ALL) + first, (UInt)(params->pixel_count - 1u));
+    const Vec3 p = vec3(GATHER(surfaces_seen, pixel, p[0]), GATHER(surfaces_seen, pixel, p[1]),
+                        GATHER(surfaces_seen, pixel, p[2]));
+    const Vec3 sum = vec3(GATHER(surfaces_seen, pixel, ns[0]), GATHER(surfaces_seen, pixel, ns[1]),
+                          GATHER(surfaces_seen, pixel, ns[2]));
+    const Mask seen = (GATHER_U(surfaces_seen, pixel, hits) > 0u) & (dot3(sum, sum) > 0.0f);
+    const Vec3 n = normalize3(pick_v(seen, sum, vec3((Float)(0.0f), (Float)(0.0f), (Float)(1.0f))));
+    const Vec3 away = sub(p, vec3_of(params->camera_origin));
+    const Float width = params->guide_width * sqrt(dot3(away, away));
+    const uint size = bucket_size(params->guide_slots);
+    const Float zero = (Float)(0.0f);
+    Float known = zero;
+    Float visits = zero;
+    Float entropy = zero;
+    Vec3 drawn = vec3_all(zero);
+    for (uint look = 0; look < VIEW_LOOKS; ++look) {
+        const UInt random = mix_bits(pixel * VIEW_LOOKS + look + 1u);
+        const CellKey key = coarse_cell_of(params, p, n, random, width, params->guide_slots);
+        const UInt found = find_lanes(guide_keys, guide_full, seen, key.bucket, size, key.key);
+        const UInt at = pick_u(found != NO_SLOT, found, (UInt)(0u));
+        const Float made_from = pick(found != NO_SLOT, GATHER(guide_cells, at, visits), zero);
+        const UInt slot = pick_u(made_from > 0.0f, found, (UInt)(NO_SLOT));
+        const Float one = pick(made_from > 0.0f, (Float)(1.0f), zero);
+        known += one;
+        visits += made_from;
+        for (uint k = 0; k < GUIDE_BINS; ++k) {
+            Float x;
+            Float y;
+            disk_of_square((Float)(((float)(k / GUIDE_SIDE) + 0.5f) / GUIDE_SIDE),
+                           (Float)(((float)(k % GUIDE_SIDE) + 0.5f) / GUIDE_SIDE), &x, &y);
+            const Float share = one * guide_density(guide_cells, slot, (UInt)(k)) * (1.0f / GUIDE_BINS);
+            entropy -= share * log2(max(share, (Float)(1e-30f)));
+            drawn = add_scaled(drawn, vec3(x, y, sqrt(1.0f - x * x - y * y)), share);
+        }
+    }
+    Vec3 s;
+    Vec3 t;
+    guide_frame(n, &s, &t);
+    const Float inverse = 1.0f / max(known, (Float)(1.0f));
+    const Vec3 direction =
+        scale(add_scaled(add_scaled(scale(s, drawn.x), t, drawn.y), n, drawn.z), inverse);
+    float lane_view[5][W];
+    store_lanes(direction.x, lane_view[0]);
+    store_lanes(direction.y, lane_view[1]);
+    store_lanes(direction.z, lane_view[2]);
+    store_lanes(entropy * inverse, lane_view[3]);
+    store_lanes(visits * inverse, lane_view[4]);
+    const uint lanes = min(params->pixel_count - first, (uint)W);
+    for (uint k = 0; k < lanes; ++k) {
+        __global GuideView *view = &guide_views[first + k];
+        for (uint c = 0; c < 3; ++c)
+            view->direction[c] = lane_view[c][k];
+        view->entropy = lane_view[3][k];
+        view->visits = lane_view[4][k];
+    }
+}
+#endif

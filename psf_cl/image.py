@@ -21,12 +21,12 @@ from psf_cl.files import read_file, write_whole
 from psf_cl.settings import AOVS as AOVS
 
 # Channel letters in the file, where they are not those that the number of components implies.
-_LETTERS = {"normal": "XYZ", "depth": "Z"}
+_LETTERS = {"normal": "XYZ", "guide": "XYZ", "depth": "Z"}
 _LETTERS_BY_COUNT = {1: "Y", 2: "XY", 3: "RGB", 4: "RGBA"}
 _LETTER_ORDER = "RGBAXYZ"
 
 # Half floats count to 2048 only; these stay float.
-_ALWAYS_FLOAT = ("depth", "samples", "cell_count", "cell_variance")
+_ALWAYS_FLOAT = ("depth", "samples", "cell_count", "cell_variance", "visits")
 _HALF_MAX = 65504.0
 
 # Stats that are the same for the same render, so that equal images are equal files.

@@ -430,7 +430,8 @@ def _ring(
     Long paths of an early pass must not stop the slots: a few times the pool in samples goes on
     behind them, at least two passes, as far as memory goes.
     """
-    planes = 1 + features["AOV_DIRECT"].value + 3 * features["AOV_FEATURES"].value
+    planes = 1 + features["AOV_DIRECT"].value + features["AOV_BOUNCES"].value
+    planes += 3 * features["AOV_FEATURES"].value
     planes += 4 * bool(features["SEEN"].value) + bool(features["BASE"].value)
     # With a vertex, what lies behind it, and about one cell: its sums and its key.
     cell_bytes = 16 + 32 + 36 if features["CELLS"].value else 0
@@ -568,6 +569,10 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             f"{', '.join(sorted(feature_aovs))} asked for",
             "no albedo, normal or depth was asked for",
         ),
+        "AOV_BOUNCES": switch(
+            "bounces" in outputs, "bounces asked for", "bounces were not asked for"
+        ),
+        "AOV_GUIDE": _aov_guide(settings, outputs),
         "GUIDE": switch(
             settings.guiding == "learned",
             "guiding is learned",
@@ -645,6 +650,22 @@ def _aov_cells(settings: Settings, outputs: frozenset[str]) -> Feature:
     return Feature(1, f"{', '.join(asked)} asked for")
 
 
+def _aov_guide(settings: Settings, outputs: frozenset[str]) -> Feature:
+    """Return whether the guide is shown.
+
+    Raises:
+        InputError: it is asked for, but not among all images, and there is none.
+    """
+    asked = sorted(outputs & set(guide.VIEWS))
+    if settings.guiding == "off":
+        if asked and outputs != set(AOVS):
+            raise InputError(f"--aov: {', '.join(asked)} needs guiding=learned; got guiding=off")
+        return Feature(0, "guiding is off")
+    if not asked:
+        return Feature(0, "no image of the guide was asked for")
+    return Feature(1, f"{', '.join(asked)} asked for")
+
+
 def _sparse(settings: Settings) -> Feature:
     """Return whether cells with few samples give way to wider ones."""
     if settings.path_filter != "hash_grid":
@@ -704,7 +725,9 @@ def _seen(settings: Settings, outputs: frozenset[str]) -> Feature:
         return Feature(2, "motion was asked for")
     if settings.screen_filter != "off":
         return Feature(1, "screen_filter compares what pixels see")
-    return Feature(0, "neither screen_filter nor temporal is on, nor motion asked for")
+    if settings.guiding != "off" and outputs & set(guide.VIEWS):
+        return Feature(1, "the guide is shown at what pixels see")
+    return Feature(0, "neither screen_filter nor temporal is on, nor motion or guide asked for")
 
 
 def _base(settings: Settings, glossy: bool) -> Feature:
@@ -739,10 +762,12 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     full["METROPOLIS"] = features["METROPOLIS"]
     # Directions would be drawn otherwise: the image would have other noise.
     full["GUIDE"] = features["GUIDE"]
+    full["AOV_GUIDE"] = features["AOV_GUIDE"]
     # Paths would end elsewhere.
     full["CACHE"] = features["CACHE"]
     if features["METROPOLIS"].value:
         names = (
+            "AOV_BOUNCES",
             "AOV_CELLS",
             "AOV_DIRECT",
             "AOV_FEATURES",

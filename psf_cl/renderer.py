@@ -536,6 +536,10 @@ class Renderer:
         aovs["samples"] = scalar(main["count"])
         if names & {"motion", "history", "alpha", "gradient"}:
             aovs |= self._temporal_aovs(main["count"], bool(partial))
+        if "film_bounces" in sums:
+            aovs["bounces"] = mean(sums["film_bounces"][0])[..., :1]
+        if names & set(guide.VIEWS):
+            aovs |= self._guide_aovs(bool(partial))
         if names & set(cells.VIEWS):
             aovs |= self._cell_aovs(main["count"])
         count = main["count"].astype(np.float64)
@@ -594,6 +598,18 @@ class Renderer:
                 views[field] if name == "cells" else (views[field] / divisor)[:, None]
             )
             for name, field in cells.VIEWS.items()
+        }
+
+    def _guide_aovs(self, partial: bool) -> dict[str, np.ndarray]:
+        """Return what the guide knows at what pixels see; 0 without a guide."""
+        views = np.zeros(self.plan.pixel_count, layout.GUIDE_VIEW.dtype)
+        if "guide_views" in self.buffers and not partial:
+            items = -(-self.plan.pixel_count // self.plan.traits.lanes)
+            self.view_guide(items, film.GROUP)
+            views = self.device.read(self.buffers["guide_views"])
+        return {
+            name: self._in_rows(views[field].reshape(len(views), -1))
+            for name, field in guide.VIEWS.items()
         }
 
     def _restored(self, counters: np.ndarray) -> np.ndarray:
@@ -1120,6 +1136,8 @@ class Renderer:
                 "freeze_guide", self.buffers, fades=0
             )
             self.renew_guide = programs["guide"].bind_planned("renew_guide", self.buffers)
+            if "guide_views" in self.buffers:
+                self.view_guide = programs["guide"].bind_planned("view_guide", self.buffers)
         self.freeze_cache: Launch | None = None
         if "cache" in programs:
             self.freeze_cache = programs["cache"].bind_planned(

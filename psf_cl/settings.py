@@ -34,6 +34,10 @@ AOVS = {
     "cell_count": "samples in these cells",
     "cell_variance": "of the luminance of these, with the surface's reflectance divided out",
     "filter_weight": "part of the samples that used the average of a cell",
+    "bounces": "of the paths, on average",
+    "guide": "mean direction that the guide draws at the first surface, world space",
+    "guide_entropy": "bits of the part that it draws: 6 as without a guide, 0 for one part",
+    "visits": "of paths that its cells there learned from",
     "gradient": "change of the light since the frame before, 0 to 1, as probes found it",
 }
 

@@ -479,7 +479,9 @@ def test_plan_follows_the_options(all_features, capsys):
 
     plan, off = features("")
     unused = {
+        "AOV_BOUNCES",
         "AOV_CELLS",
+        "AOV_GUIDE",
         "BACK_FACES",
         "BASE",
         "CACHE",

@@ -149,6 +149,19 @@ def test_direct_is_what_one_bounce_brings_and_indirect_is_the_rest(device):
     assert image.aovs["indirect"].min() >= -1e-5 * image.rgb.max()
 
 
+def test_bounces_are_those_of_the_paths(device):
+    """In a closed room all paths have as many as they may; else the rays have been counted too."""
+    box = (primitives.box(), transform.scaling(4.0), glowing(1.0, 0.5, double_sided=True))
+    closed = build([box], camera((0, 0, 0.5), (0, 0, 0), 60), SIZE)
+    image = render(device, closed, 4, ["bounces"], max_depth=3, termination="off")
+    np.testing.assert_array_equal(image.aovs["bounces"], 3.0)
+    scene = build([floor(2.0, lambertian(0.7)), box], camera((0, 0.4, 1), (0, 0, 0), 60), SIZE)
+    image = render(device, scene, 16, ["bounces"])
+    rays = image.stats["rays"]
+    assert image.aovs["bounces"].std() > 0
+    assert image.aovs["bounces"].mean() == pytest.approx(rays["bounce"] / rays["camera"], rel=1e-6)
+
+
 @pytest.mark.parametrize("direct_sampling", ["light", "bsdf"])
 def test_direct_does_not_hang_on_how_light_is_found(device, direct_sampling):
     image = render(

@@ -292,6 +292,53 @@ def test_bits_do_not_depend_on_the_pool(device, small):
     assert noisy(larger, 20, **LEARN).rgb.tobytes() == image.rgb.tobytes()
 
 
+def shown(device, density):
+    """Return what is shown of a guide whose cells all have this density, of a floor from above."""
+    scene = build(
+        [floor(3.0, lambertian(0.5))], camera((0, 3, 0.1), (0, 0, 0), 30), (8, 8), environment=1.0
+    )
+    opened = renderer(device, scene, tuple(guide.VIEWS), **LEARN)
+    opened.render(spp=1)
+    cells = opened.device.read(opened.buffers["guide_cells"])
+    cells["density"], cells["visits"] = density, 7.0
+    opened.device.write(opened.buffers["guide_cells"], cells)
+    aovs = opened.image().aovs
+    opened.close()
+    return aovs
+
+
+@pytest.mark.parametrize(("row", "column"), [(0, 3), (4, 4), (6, 1)])
+def test_images_of_the_guide_show_the_part_that_it_draws(small, row, column):
+    density = np.zeros((SIDE, SIDE))
+    density[row, column] = PARTS
+    aovs = shown(small, density.ravel())
+    np.testing.assert_allclose(aovs["guide_entropy"], 0.0, atol=1e-5)
+    np.testing.assert_allclose(aovs["visits"], 7.0, rtol=1e-6)
+    # The concentric map of the middle of the part, on a floor whose tangents are z and x.
+    a, b = (2 * (np.array([row, column]) + 0.5) / SIDE - 1).tolist()
+    radius, angle = (
+        (a, np.pi / 4 * b / a) if abs(a) > abs(b) else (b, np.pi / 2 - np.pi / 4 * a / b)
+    )
+    z, x = radius * np.cos(angle), radius * np.sin(angle)
+    expected = np.broadcast_to([x, np.sqrt(1 - x * x - z * z), z], (8, 8, 3))
+    np.testing.assert_allclose(aovs["guide"], expected, atol=1e-5)
+
+
+def test_images_of_a_guide_that_knows_nothing_are_those_of_the_cosine(small):
+    aovs = shown(small, 1.0)
+    np.testing.assert_allclose(aovs["guide_entropy"], 6.0, atol=1e-4)
+    # Of the middles of the parts: squares around the middle become circles.
+    middles = 2 * (np.arange(SIDE) + 0.5) / SIDE - 1
+    radius = np.maximum(np.abs(middles)[:, None], np.abs(middles))
+    up = np.broadcast_to([0, np.sqrt(1 - radius**2).mean(), 0], (8, 8, 3))
+    np.testing.assert_allclose(aovs["guide"], up, atol=1e-5)
+
+
+def test_images_of_a_guide_are_refused_where_there_is_none():
+    with pytest.raises(InputError, match="--aov: guide, visits needs guiding=learned"):
+        make_plan(room(), Settings(), ["guide", "visits"])
+
+
 def patched(opened, **values):
     """Change parameters that no setting has."""
     params = opened.device.read(opened.buffers["params"])

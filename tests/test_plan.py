@@ -57,7 +57,7 @@ SKIES = {
     "ENVIRONMENT": Environment((1.0, 1.0, 1.0)),
     "ENVIRONMENT image": Environment((1.0, 1.0, 1.0), np.ones((2, 4, 3), np.float32)),
 }
-OUTPUTS = {"AOV_DIRECT": "direct", "AOV_FEATURES": "albedo"}
+OUTPUTS = {"AOV_BOUNCES": "bounces", "AOV_DIRECT": "direct", "AOV_FEATURES": "albedo"}
 CHOICES = [*PARTS, *LIGHTS, *SKIES, "LENS", *OUTPUTS, "FEW"]
 
 ALWAYS = {
@@ -75,6 +75,7 @@ NEEDED = {
     "PUNCTUAL_LIGHTS": {"lights"},
     "ENVIRONMENT": {"lights"},
     "ENVIRONMENT image": {"lights", "environment"},
+    "AOV_BOUNCES": {"bounces", "film_bounces"},
     "AOV_DIRECT": {"direct", "film_direct"},
     "AOV_FEATURES": {"features", "film_features"},
 }

@@ -86,6 +86,12 @@
 #ifndef CELLS
 #error "CELLS must be 0, 1 (all of a vertex's light is shared) or 2 (that of its diffuse base)"
 #endif
+#ifndef AOV_BOUNCES
+#error "AOV_BOUNCES must be 0 or 1"
+#endif
+#ifndef AOV_GUIDE
+#error "AOV_GUIDE must be 0 or 1"
+#endif
 #ifndef AOV_CELLS
 #error "AOV_CELLS must be 0 or 1"
 #endif

@@ -708,3 +708,11 @@ typedef struct {
     float visits; // that it is made from; 0: nothing is known
     float pad[6]; // fills the record
 } GuideCell;
+
+/// What the guide knows at what a pixel sees.
+typedef struct {
+    float direction[3]; // mean of those that it draws, world; 0 where nothing is known
+    float entropy; // of the parts of the hemisphere that they are in, bits
+    float visits; // that its cells are made from
+    float pad[3]; // fills the record
+} GuideView;

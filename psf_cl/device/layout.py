@@ -643,6 +643,17 @@ GUIDE_CELL = Record(
     """),
 )
 
+GUIDE_VIEW = Record(
+    "GuideView",
+    "What the guide knows at what a pixel sees.",
+    _fields("""
+    float direction[3] - mean of those that it draws, world; 0 where nothing is known
+    float entropy - of the parts of the hemisphere that they are in, bits
+    float visits - that its cells are made from
+    float pad[3] - fills the record
+    """),
+)
+
 RECORDS = (
     PARAMS,
     BVH_NODE,
@@ -682,6 +693,7 @@ RECORDS = (
     CACHE_CELL,
     GUIDE_SUM,
     GUIDE_CELL,
+    GUIDE_VIEW,
 )
 
 #: Words of every path's state, in the order in which they lie in a block of the pool.

@@ -38,6 +38,9 @@ def plan(context: Context) -> StageSpec | None:
         buffers.append(
             BufferSpec("direct", np.dtype(np.float32), samples, "direct light of the same", True)
         )
+    if context.on("AOV_BOUNCES"):
+        what = "bounces of the same"
+        buffers.append(BufferSpec("bounces", np.dtype(np.float32), samples, what, True))
     base: tuple[str, ...] = ()
     if context.on("BASE"):
         base = ("base",)
@@ -51,14 +54,15 @@ def plan(context: Context) -> StageSpec | None:
         reads=(*started, *named, *shared),
         writes=(*started, *named),
         # A weighted sample a plane.
-        record_bytes=16 * (1 + len(direct) + len(base) + context.on("CELLS")),
+        record_bytes=16
+        * (1 + len(direct) + len(base) + context.on("CELLS") + context.on("AOV_BOUNCES")),
         runs=True,
     )
     return StageSpec(
         "camera",
         "paths start at the camera",
         "camera.cl",
-        flags=("LENS", "AOV_DIRECT", *POOL_FLAGS),
+        flags=("LENS", "AOV_BOUNCES", "AOV_DIRECT", *POOL_FLAGS),
         kernels=(kernel,),
         buffers=tuple(buffers),
     )

@@ -11,6 +11,7 @@ from psf_cl.stages.spec import POOL_FLAGS, BufferSpec, Context, KernelSpec, Stag
 PLANES = (
     ("samples", "film", 1),
     ("direct", "film_direct", 1),
+    ("bounces", "film_bounces", 1),
     ("base", "film_base", 1),
     ("features", "film_features", 3),
 )
@@ -30,6 +31,8 @@ def plan(context: Context) -> StageSpec:
         buffers.append(
             BufferSpec("film_direct", dtype, context.pixel_count, "sums of the direct light")
         )
+    if context.on("AOV_BOUNCES"):
+        buffers.append(BufferSpec("film_bounces", dtype, context.pixel_count, "sums of bounces"))
     if context.on("BASE"):
         what = "sums of what first surfaces reflect"
         buffers.append(BufferSpec("film_base", dtype, context.pixel_count, what))
@@ -39,6 +42,7 @@ def plan(context: Context) -> StageSpec:
             BufferSpec("film_features", dtype, count, "sums of albedo, normal and depth")
         )
     planes = 1 + context.on("AOV_DIRECT") + context.on("BASE") + 3 * context.on("AOV_FEATURES")
+    planes += context.on("AOV_BOUNCES")
     # A weighted value; the sums are read and written.
     sample_bytes = planes * (16 + 2 * dtype.itemsize)
     kernels = [

@@ -44,6 +44,10 @@ ENOUGH_VISITS = 32.0
 PASSES_WITHOUT = 256
 
 
+#: Images of the guide, and where ``layout.GUIDE_VIEW`` has them.
+VIEWS = {"guide": "direction", "guide_entropy": "entropy", "visits": "visits"}
+
+
 def slots_of(pixel_count: int) -> int:
     """Return the slots of the table."""
     return min(max(slots_for(pixel_count // PIXELS_PER_SLOT), LEAST_SLOTS), MOST_SLOTS)
@@ -109,15 +113,22 @@ def plan(context: Context) -> StageSpec | None:
         BufferSpec("guide_sums", sums, slots, "what the guide learns"),
         BufferSpec("guide_cells", cells, slots, "what the guide knows"),
     )
+    views: tuple[KernelSpec, ...] = ()
+    if context.on("AOV_GUIDE"):
+        what = "what the guide knows at what pixels see"
+        view = BufferSpec("guide_views", layout.GUIDE_VIEW.dtype, context.pixel_count, what, True)
+        buffers += (view,)
+        views = (KernelSpec("view_guide"),)
     kernels = (
         KernelSpec("renew_guide", record_bytes=4, lanes=False),
         KernelSpec("freeze_guide", record_bytes=4 + sums.itemsize + cells.itemsize, lanes=False),
+        *views,
     )
     return StageSpec(
         "guide",
         "directions are drawn by what was learned",
         "guide.cl",
-        flags=("GUIDE",),
+        flags=("GUIDE", "AOV_GUIDE"),
         kernels=kernels,
         buffers=buffers,
         per_pass=True,
