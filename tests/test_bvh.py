@@ -64,14 +64,12 @@ class Traced:
             "rays": self.device.upload("rays", np.ascontiguousarray(rays, np.float32)),
             **{name: self.device.allocate(name, *shape) for name, shape in outputs.items()},
         }
-        program.bind(
-            kernel,
-            nodes=self.bvh.nodes,
-            blocks=self.bvh.blocks,
-            ray_count=len(rays),
-            inverted=int(inverted or 0),
-            **buffers,
-        )(len(rays), group=64)
+        values = {"blocks": self.bvh.blocks, "inverted": int(inverted or 0)}
+        if kernel == "meet_boxes":
+            values.clear()
+        program.bind(kernel, nodes=self.bvh.nodes, ray_count=len(rays), **values, **buffers)(
+            len(rays), group=64
+        )
         results = [self.device.read(buffers[name]) for name in outputs]
         self.device.release(*buffers.values())
         return results
@@ -570,3 +568,27 @@ def test_rays_along_the_axes_do_not_slip_between_faces(traced):
         assert (found != NO_HIT).all()
         np.testing.assert_allclose(distances[:, 0], 3.0, rtol=1e-6)
         assert tree.any(make_rays(origins, directions)).all()
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("sign", [1.0, -1.0, 0.0, -0.0])
+def test_rays_across_an_axis_pass_by_boxes_beside_them(traced, axis, sign):
+    """Where the ray does not move, or hardly does, only the box that it is in is met."""
+    rng = np.random.default_rng(3)
+    corners = rng.uniform(0, 0.5, (32, 3, 3))
+    # Eight heaps of four along the axis, on both sides of 0.
+    corners[:, :, axis] += np.repeat(np.arange(8), 4)[:, None] - 4
+    tree = traced(corners)
+    other = (axis + 1) % 3
+    bounds = tree.nodes[0]["bounds"].reshape(3, 2, 8)
+    middles = bounds.mean(axis=1).T
+    directions = np.zeros((8, 3))
+    directions[:, other] = 1.0
+    directions[:, axis] = sign * 1e-30
+    origins = middles - 3.0 * directions
+    origins[:, axis] = middles[:, axis]
+    met = tree.run("meet_boxes", make_rays(origins, directions), met=(np.uint32, 8))[0]
+    lo, hi = bounds[axis]
+    inside = (middles[:, axis, None] >= lo) & (middles[:, axis, None] <= hi)
+    assert inside.sum() == 8
+    np.testing.assert_array_equal(met, (inside << np.arange(8)).sum(axis=1))

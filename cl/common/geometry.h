@@ -37,7 +37,7 @@ typedef struct {
 
 /// What depends on the ray alone: boxes' rows and planes, and the shear that turns the ray into z.
 typedef struct {
-    float inverse[3]; // 1 / direction; infinite for 0
+    float inverse[3]; // 1 / direction; large for 0
     float far_inverse[3]; // the same times BOX_FAR_FACTOR
     float near_shift[3]; // minus the origin, moved back by its slack, times inverse
     float far_shift[3]; // minus the origin, moved on, times far_inverse
@@ -82,7 +82,11 @@ static inline void set_up_rays(RaySetups *rays, Mask active, Vec3 origin, Vec3 d
     store_lanes(pick(usable, t_max, (Float)(0.0f)), rays->t_max);
 
     const Float slack = BOX_SLACK * reach;
-    const Vec3 inverse = vec3(1.0f / direction.x, 1.0f / direction.y, 1.0f / direction.z);
+    // Along an axis that the ray does not follow boxes must still be told apart: infinities would not.  What
+    // the ray moves too far this way is less than the slack.
+    const Float least = longest * 0x1p-60f;
+    const Vec3 inverse = vec3(1.0f / pick(x < least, least, direction.x), 1.0f / pick(y < least, least, direction.y),
+                              1.0f / pick(z < least, least, direction.z));
     const Float slack_x = pick(inverse.x < 0.0f, -slack, slack);
     const Float slack_y = pick(inverse.y < 0.0f, -slack, slack);
     const Float slack_z = pick(inverse.z < 0.0f, -slack, slack);

@@ -86,3 +86,23 @@ kernel void trace_any_rays(
     for (uint k = 0; k < W && first + k < ray_count; ++k)
         blocked[first + k] = bits >> k & 1u;
 }
+
+/// reads   rays, as above; the first node
+/// writes  met[i]: bit k is set if the ray may meet child k
+kernel void meet_boxes(
+    global const BvhNode *nodes,
+    global const float *rays,
+    global uint *met,
+    const uint ray_count)
+{
+    const uint first = get_global_id(0) * W;
+    if (first >= ray_count)
+        return;
+    RaySetups setups;
+    load_rays(&setups, rays, first, ray_count);
+    for (uint k = 0; k < W && first + k < ray_count; ++k) {
+        const RaySetup ray = ray_setup(&setups, k);
+        float8 near;
+        met[first + k] = bits_of_8(intersect_boxes(&nodes[0], &ray, ray.t_max, &near));
+    }
+}
