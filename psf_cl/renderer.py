@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from psf_cl import __version__, motion, tables
+from psf_cl import __version__, learned, motion, tables
 from psf_cl.chains import Chains
 from psf_cl.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from psf_cl.device import layout
@@ -122,6 +122,7 @@ class Renderer:
         self.plan: Plan = plan_for(there)
         self.running = self.plan
         self.guide_out: int | None = None
+        self.loaded: str | None = None
         self.compile_seconds = 0.0
         self.technique_seconds = 0.0
         self.statistics = statistics
@@ -684,6 +685,48 @@ class Renderer:
         if state.device != self.device.name:
             self.other_device = state.device
 
+    def save_cache(self, path: str | os.PathLike[str]) -> None:
+        """Write what guide and radiance cache have learned, for renders from other places.
+
+        Raises:
+            InputError: nothing is learned, or the file cannot be written.
+        """
+        names = learned.table_names(self.settings, str(path))
+        self.settle()
+        tables = {name: self.device.read(self.buffers[name]) for name in names}
+        learned.write_learned(path, self._learned_identity(), tables)
+
+    def load_cache(self, path: str | os.PathLike[str]) -> None:
+        """Begin with what another render has learned; only before the first pass.
+
+        Raises:
+            InputError: nothing is learned; or the file is missing, damaged, or of another scene,
+                size or settings.
+        """
+        names = learned.table_names(self.settings, str(path))
+        buffers = {name: (self.buffers[name].dtype, self.buffers[name].count) for name in names}
+        tables, self.loaded = learned.read_learned(path, self._learned_identity(), buffers)
+        for name, table in tables.items():
+            self.device.write(self.buffers[name], table)
+
+    def _learned_identity(self) -> dict[str, Any]:
+        """Return what tables of this render belong to: the scene, but not the camera in it."""
+        return {
+            "version": f"{__version__} {source_digest()}",
+            "scene": {
+                "center": [float(x) for x in self.center],
+                "radius": float(self.radius),
+                "triangles": len(self.cut_out),
+                "brightest": cells.brightest(self.moving),
+            },
+            "settings": {name: getattr(self.settings, name) for name in learned.SETTINGS},
+            "tables": {
+                f"{name}_slots": self.buffers[f"{name}_keys"].count
+                for name in ("guide", "cache")
+                if f"{name}_keys" in self.buffers
+            },
+        }
+
     @cached_property
     def identity(self) -> dict[str, Any]:
         """Return what a checkpoint of this render belongs to, as plain JSON values."""
@@ -697,6 +740,7 @@ class Renderer:
                 "aov": sorted(self.plan.outputs),
                 "noise": "film_half" in self.buffers,
             },
+            "loaded cache": self.loaded,
         }
 
     def _lasting(self) -> dict[str, tuple[np.dtype[Any], int]]:
@@ -766,10 +810,10 @@ class Renderer:
             if new_frame:
                 self.renew_guide(buckets_of(slots), film.GROUP)
             # What was learned from little fades, and what was true before something changed.
-            fades = 0 < start <= guide.FADING_PASSES or (new_frame and self.changed)
+            fades = self._is_new(start) or (new_frame and self.changed)
             self.freeze_guide.set(fades=int(fades))
             self.freeze_guide(slots, film.GROUP)
-            if start >= guide.FIRST_DECISION:
+            if start >= guide.FIRST_DECISION or self.loaded:
                 cells = self.device.read(self.buffers["guide_cells"])
                 if not guide.is_worth_it(cells, self.settings.guide_share):
                     self._guide(False, start)
@@ -780,9 +824,13 @@ class Renderer:
         new_frame = start == self.scheduler.first > 0
         if new_frame:
             self.renew_cache(buckets_of(slots), film.GROUP)
-        fades = 0 < start <= guide.FADING_PASSES or (new_frame and self.changed)
+        fades = self._is_new(start) or (new_frame and self.changed)
         self.freeze_cache.set(fades=int(fades))
         self.freeze_cache(slots, film.GROUP)
+
+    def _is_new(self, start: int) -> bool:
+        """Return whether what is known at pass ``start`` was learned from little."""
+        return 0 < start <= guide.FADING_PASSES and not self.loaded
 
     def _limit_learning(self, start: int) -> None:
         """Say which passes of the epoch of pass ``start`` guide and cache learn from."""

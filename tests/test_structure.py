@@ -19,7 +19,8 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # A module imports its own row and lower ones; "" is `import psf_cl`.
 ROWS = [
-    {"errors", "files", "settings", "traits", "image", "checkpoint", "__version__", ""},
+    {"errors", "files", "settings", "traits", "image", "state_file", "__version__", ""}
+    | {"checkpoint", "learned"},
     {"scene", "measure"},
     {"device"},
     {"stages", "tables", "instancing", "motion", "mover"},

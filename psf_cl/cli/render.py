@@ -114,6 +114,15 @@ def add_parser(commands: Any) -> None:
         type=file_argument,
         help="go on from a checkpoint; budgets count what it holds",
     )
+    parser.add_argument(
+        "--save-cache",
+        metavar="FILE",
+        type=file_argument,
+        help="write what guide and radiance cache have learned, for renders from other places",
+    )
+    parser.add_argument(
+        "--load-cache", metavar="FILE", type=file_argument, help="begin with what was learned"
+    )
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     parser.set_defaults(run=run)
 
@@ -122,6 +131,7 @@ def run(args: argparse.Namespace) -> int:
     """Check everything that can be checked, render, write; return 130 if interrupted on the way."""
     from psf_cl.files import check_writable, remove_leftovers, write_whole
     from psf_cl.image import json_text, output_paths, write_exr, write_png
+    from psf_cl.learned import table_names
     from psf_cl.plan import make_plan
 
     if args.frames and (args.checkpoint or args.resume):
@@ -129,7 +139,7 @@ def run(args: argparse.Namespace) -> int:
     frames = args.frames or range(1)
     paths = [output_paths(_frame_name(args, frame)) for frame in frames]
     outputs = [path for pair in paths for path in pair]
-    outputs += [Path(name) for name in (args.stats, args.checkpoint) if name]
+    outputs += [Path(name) for name in (args.stats, args.checkpoint, args.save_cache) if name]
     for path in outputs:
         check_writable(path)
         remove_leftovers(path)
@@ -141,7 +151,11 @@ def run(args: argparse.Namespace) -> int:
         opening = background.submit(open_prepared_device, args.device, statistics, read)
         scene, settings = load_with_settings(args)
         read.set()
-        check_distinct(outputs, [*scene.files, args.reference, _other_checkpoint(args)])
+        inputs = [_other(args.resume, args.checkpoint), _other(args.load_cache, args.save_cache)]
+        check_distinct(outputs, [*scene.files, args.reference, *inputs])
+        for option in ("save_cache", "load_cache"):
+            if getattr(args, option):
+                table_names(settings, f"--{option.replace('_', '-')}")
         # For its checks; the device's own traits come later.
         make_plan(scene, settings, args.aov, crop=args.crop, room=room_of(args))
         reference = _reference(args, scene) if args.reference else None
@@ -164,8 +178,10 @@ def run(args: argparse.Namespace) -> int:
         **first_time(args),
         room=room_of(args),
     )
-    if args.resume:
-        with closed_on_error(renderer):
+    with closed_on_error(renderer):
+        if args.load_cache:
+            renderer.load_cache(args.load_cache)
+        if args.resume:
             _resume(renderer, args)
     if not args.quiet:
         tell_notes(renderer.notes)
@@ -184,6 +200,8 @@ def run(args: argparse.Namespace) -> int:
                 print(_summary(exr, image))
             if interrupted():
                 break
+        if args.save_cache:
+            renderer.save_cache(args.save_cache)
         if args.stats:
             stats = {"frames": all_stats} if args.frames else all_stats[0]
             stats["process_seconds"] = time.perf_counter() - START
@@ -267,11 +285,10 @@ def _resume(renderer: Renderer, args: argparse.Namespace) -> None:
         )
 
 
-def _other_checkpoint(args: argparse.Namespace) -> str | None:
-    """Return the file that is resumed, unless it is the one to be written too, as it may be."""
-    same = args.resume and args.checkpoint
-    same = same and os.path.realpath(args.resume) == os.path.realpath(args.checkpoint)
-    return None if same else args.resume
+def _other(read: str | None, written: str | None) -> str | None:
+    """Return the file that is read, unless it is the one to be written too, as it may be."""
+    same = read and written and os.path.realpath(read) == os.path.realpath(written)
+    return None if same else read
 
 
 @contextlib.contextmanager
