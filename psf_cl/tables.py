@@ -28,7 +28,7 @@ from psf_cl.scene.model import (
     is_invisible,
     shines,
 )
-from psf_cl.scene.texture import decoded_srgb
+from psf_cl.scene.texture import decoded_srgb, mean_color
 
 #: Chance that the light table keeps for emitters of finite size where there is also light from
 #: infinitely far: its flux through the scene says little about how much of it comes in.
@@ -661,10 +661,7 @@ def _mean_emission(scene: Scene, material: Material) -> np.ndarray:
     emission = np.asarray(material.emission, np.float64)
     if not emits(material) or material.emission_texture < 0:
         return emission
-    texture = scene.textures[material.emission_texture]
-    colors = texture.pixels[..., :3].reshape(-1, 3)
-    linear = srgb_to_linear()[colors] if texture.srgb else colors / 255.0
-    return emission * linear.mean(axis=0)
+    return emission * mean_color(scene.textures[material.emission_texture])
 
 
 def _environment_weights(image: np.ndarray) -> np.ndarray:

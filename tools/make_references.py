@@ -43,7 +43,7 @@ from psf_cl.image import Image, json_text, output_paths, read_exr, write_exr, wr
 from psf_cl.measure.curves import Reference
 from psf_cl.measure.references import RunningReference
 from psf_cl.scene.digest import scene_digest
-from psf_cl.scene.load import load_scene
+from psf_cl.scene.load import NO_ENVIRONMENT, load_scene
 from psf_cl.scene.model import Scene
 from psf_cl.settings import Settings
 
@@ -198,7 +198,7 @@ def resumed(
 
 def _record(args: argparse.Namespace, image: Image) -> dict[str, Any]:
     """Return what is needed to tell whether the picture still is of this scene."""
-    files = [path for path in (args.scene, args.environment) if path]
+    files = [path for path in (args.scene, args.environment) if path not in (None, NO_ENVIRONMENT)]
     return {
         "version": psf_cl.__version__,
         "made": datetime.now(UTC).isoformat(timespec="seconds"),

@@ -156,7 +156,7 @@ def add_picture_arguments(parser: argparse.ArgumentParser) -> None:
         "--environment",
         metavar="FILE",
         type=file_argument,
-        help="lat-long image (.exr, .hdr) as the scene's sky",
+        help="lat-long image (.exr, .hdr) as the scene's sky; none for no sky",
     )
 
 

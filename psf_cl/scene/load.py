@@ -11,6 +11,7 @@ import numpy as np
 from psf_cl.errors import InputError
 from psf_cl.scene import mesh, transform
 from psf_cl.scene.animation import baked, is_animated, settled
+from psf_cl.scene.default_sky import with_default_sky
 from psf_cl.scene.environment import load_environment
 from psf_cl.scene.gltf import load_gltf
 from psf_cl.scene.model import (
@@ -21,15 +22,13 @@ from psf_cl.scene.model import (
     Material,
     Mesh,
     Scene,
-    emits,
-    has_environment,
-    is_invisible,
-    shines,
 )
 from psf_cl.scene.toml_file import MAX_SIZE, load_toml
 
 DEFAULT_FOV_Y = math.radians(45)
-DEFAULT_SKY = (1.0, 1.0, 1.0)
+
+#: In place of a file: no light from infinitely far away.
+NO_ENVIRONMENT = "none"
 
 _GLTF = (".gltf", ".glb")
 _MESH_FILES = (*_GLTF, *mesh.SUFFIXES)
@@ -47,11 +46,12 @@ def load_scene(
 ) -> Scene:
     """Read a scene and complete it, so that it has triangles, a camera and light.
 
-    Without a camera the view frames the scene; without any light there is a sky of radiance 1.
-    Both are told in ``Scene.notes``.
+    Without a camera the view frames the scene; without light there is a sky of radiance 1, see
+    ``with_default_sky``.  Both are told in ``Scene.notes``.
 
     Args:
-        environment: an .exr or .hdr file to use instead of the scene's environment.
+        environment: an .exr or .hdr file to use instead of the scene's environment; "none" for no
+            sky at all.
         camera: name of the camera to use.
         size: width and height in pixels instead of the scene's.
         clip: name or number of the animation of a glTF file to play; see ``read_curves``.
@@ -75,7 +75,9 @@ def load_scene(
         raise InputError(f"{path} has no triangles")
     if count > MAX_TRIANGLES:
         raise InputError(f"{path}: expected at most {MAX_TRIANGLES} triangles; got {count}")
-    if environment is not None:
+    if environment == NO_ENVIRONMENT:
+        scene = replace(scene, environment=Environment())
+    elif environment is not None:
         image, notes = load_environment(Path(environment))
         scene = replace(
             scene,
@@ -83,7 +85,9 @@ def load_scene(
             notes=scene.notes + notes,
             files=(*scene.files, str(environment)),
         )
-    scene = _with_light(_with_camera(_with_size(scene, size), camera, time))
+    scene = _with_camera(_with_size(scene, size), camera, time)
+    if environment != NO_ENVIRONMENT:
+        scene = with_default_sky(scene, opened=not is_toml)
     if moving and not is_animated(scene):
         note = "nothing in the scene is animated: every frame shows the same"
         scene = replace(scene, notes=(*scene.notes, note))
@@ -170,15 +174,6 @@ def _box_corners(mesh: Mesh) -> np.ndarray:
         return np.zeros((0, 3))
     ends = np.stack([points.min(axis=0), points.max(axis=0)]).astype(np.float64)
     return ends[np.indices((2, 2, 2)).reshape(3, 8).T, np.arange(3)]
-
-
-def _with_light(scene: Scene) -> Scene:
-    used = [scene.materials[index] for index in {shape.material for shape in scene.shapes}]
-    emitting = any(emits(material) and not is_invisible(material) for material in used)
-    if emitting or any(map(shines, scene.lights)) or has_environment(scene.environment):
-        return scene
-    note = "the scene has no light: a sky of constant radiance (1, 1, 1) is added"
-    return replace(scene, environment=Environment(DEFAULT_SKY), notes=(*scene.notes, note))
 
 
 def _without_unused(scene: Scene) -> Scene:

@@ -91,3 +91,11 @@ def _rgba(image: Image.Image, source: str) -> np.ndarray:
 def decoded_srgb(values: np.ndarray) -> np.ndarray:
     """Return linear values of sRGB ones, both from 0 to 1 (IEC 61966-2-1)."""
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+def mean_color(texture: Texture) -> np.ndarray:
+    """Return the mean of the texels of a texture, ``(3,)``, linear."""
+    codes = np.arange(256) / 255.0
+    values = decoded_srgb(codes) if texture.srgb else codes
+    counts = [np.bincount(texture.pixels[..., c].ravel(), minlength=256) for c in range(3)]
+    return np.stack(counts) @ values / max(texture.pixels[..., 0].size, 1)
