@@ -9,10 +9,11 @@
 #include "common/guide.h"
 #include "common/cache.h"
 
-/// Trace the shadow rays of the W paths of a work item; returns how many there were.
+/// Trace a shadow ray of each of the W paths of a work item; returns how many there were.
 static inline uint connect_paths(
     __global const Params *params,
     __global Float *path,
+    uint ray,
 #if GUIDE
     volatile __global uint *counters,
     __global GuideSum *guide_sums,
@@ -24,13 +25,13 @@ static inline uint connect_paths(
 #endif
     GEOMETRY_BUFFERS)
 {
-    const Vec3 light = get_v(path, PATH_LIGHT_R);
+    const Vec3 light = get_v(path, RAY_FIELD(ray, LIGHT_R));
     // Not a number must not vanish here: it goes on into the sample, which is rejected and counted.
     const Mask wanted = !(light.x + light.y + light.z <= 0.0f);
     if (!any_lane(wanted))
         return 0;
     DEFINE_RAY_TRAITS(path, (get_u(path, PATH_STATUS) & DEPTH_MASK) * 2u + 1u);
-    const Mask blocked = blocked_rays(params, wanted, get_v(path, PATH_SHADOW_X), get_v(path, PATH_TOWARD_X),
+    const Mask blocked = blocked_rays(params, wanted, get_v(path, RAY_FIELD(ray, SHADOW_X)), get_v(path, RAY_FIELD(ray, TOWARD_X)),
                                       GEOMETRY_ARGUMENTS);
     const Vec3 zero = vec3_all((Float)(0.0f));
     const Vec3 arrives = pick_v(wanted & !blocked, light, zero);
@@ -43,7 +44,7 @@ static inline uint connect_paths(
 #if CELLS
     const UInt vertex = get_u(path, PATH_VERTEX) & VERTEX_MASK;
 #if CELLS == 2
-    const Vec3 share = get_v(path, PATH_LIGHT_SHARE_R);
+    const Vec3 share = get_v(path, RAY_FIELD(ray, LIGHT_SHARE_R));
 #else
     const Vec3 share = vec3_all((Float)(1.0f));
 #endif
@@ -56,7 +57,7 @@ static inline uint connect_paths(
     const Mask reflected = MASK_ALL;
 #endif
 #if BASE == 2
-    keep_base(path, reflected, get_v(path, PATH_BASE_LIGHT_R), rest);
+    keep_base(path, reflected, get_v(path, RAY_FIELD(ray, BASE_LIGHT_R)), rest);
 #elif BASE
     keep_base(path, reflected, vec3_all((Float)(1.0f)), rest);
 #endif
@@ -67,16 +68,16 @@ static inline uint connect_paths(
     const UInt bits = mix_bits(get_u(path, PATH_SEED) + get_u(path, PATH_SAMPLE) * 0x85ebca6bu
                                + get_u(path, PATH_STATUS) * 0x9e3779b9u);
     learn_cached(params, cache_sums, cache_cells, cache_counters, wanted & !blocked, get_u(path, PATH_CACHE),
-                 get_v(path, PATH_CACHE_LIGHT_R), bits);
+                 get_v(path, RAY_FIELD(ray, CACHE_LIGHT_R)), bits);
 #endif
 #if GUIDE
     // What the ray before met reflects this light along it.
     const UInt noise = mix_bits(get_u(path, PATH_SEED) + get_u(path, PATH_SAMPLE) * 0x9e3779b9u
                                 + get_u(path, PATH_STATUS) * 0x85ebca6bu);
     learn(params, guide_sums, counters, wanted & !blocked, get_u(path, PATH_GUIDE_FROM),
-          FIELD(path, PATH_GUIDE_LIGHT), 0, noise);
+          FIELD(path, RAY_FIELD(ray, GUIDE_LIGHT)), 0, noise);
 #endif
-    put_v(path, PATH_LIGHT_R, zero);
+    put_v(path, RAY_FIELD(ray, LIGHT_R), zero);
     return count_lanes(wanted);
 }
 
@@ -104,15 +105,21 @@ kernel void connect_lights(
     const uint first = get_global_id(0) * RUN;
     const uint end = min(first + RUN, params->slots / W);
     uint wanted = 0;
+#if SHADOW_RAYS
+    const uint rays = SHADOW_RAYS;
+#else
+    const uint rays = 1;
+#endif
     for (uint item = first; item < end; ++item)
-        wanted += connect_paths(params, pool_at(pool, item),
+        for (uint ray = 0; ray < rays; ++ray)
+            wanted += connect_paths(params, pool_at(pool, item), ray,
 #if GUIDE
-                                counters, guide_sums,
+                                    counters, guide_sums,
 #endif
 #if CACHE
-                                counters, cache_sums, cache_cells,
+                                    counters, cache_sums, cache_cells,
 #endif
-                                GEOMETRY_BUFFER_ARGUMENTS);
+                                    GEOMETRY_BUFFER_ARGUMENTS);
     if (wanted > 0)
         atomic_add(&counters[COUNTER_PENDING_SHADOW], wanted);
 }

@@ -138,10 +138,53 @@ static inline void store_features(
 }
 #endif
 
+#if AOV_LIGHTS
+/// Hand in how a light was chosen: photons and groups of lights of the cell, chance of the light.
+static inline void store_choice(
+    __global const Params *params,
+#if AOV_LIGHTS == 2
+    __global const uint *particle_words,
+    __global const uint *particle_counts,
+    UInt row,
+#endif
+    __global float *choices,
+    Mask mask,
+    Mask chosen,
+    UInt sample,
+    UInt pixel,
+    Float pmf)
+{
+    float lane_pmf[W];
+    uint lane_sample[W];
+    uint lane_pixel[W];
+    store_lanes(pmf, lane_pmf);
+    store_lanes_u(sample & (params->ring - 1u), lane_sample);
+    store_lanes_u(pixel, lane_pixel);
+    const uint chosen_bits = lane_bits(chosen);
+#if AOV_LIGHTS == 2
+    uint lane_row[W];
+    store_lanes_u(row, lane_row);
+#endif
+    for (uint left = lane_bits(mask); left; left &= left - 1u) {
+        const uint k = lowest_bit(left);
+        uint photons = 0;
+        uint groups = 0;
+        const uint is_chosen = chosen_bits >> k & 1u;
+#if AOV_LIGHTS == 2
+        if (is_chosen && lane_row[k] != NO_PLACE)
+            photons = count_in_row(params, particle_words, particle_counts, lane_row[k], &groups);
+#endif
+        const ulong at = (ulong)lane_sample[k] * params->pixel_count + lane_pixel[k];
+        const float4 values = (float4)((float)photons, (float)groups, lane_pmf[k], 1.0f);
+        vstore4(is_chosen ? values : (float4)(0.0f), at, choices);
+    }
+}
+#endif
+
 /// Shade what the rays hit, prepare a shadow ray, and send the paths on or end them.
 ///
 /// reads   pool, scene tables
-/// writes  pool.{status, origin, direction, beta, radiance, direct, pdf, shadow, toward, light}; features;
+/// writes  pool.{status, origin, direction, beta, radiance, direct, pdf, shadow, toward, light}; features, choices;
 ///         with LIGHT_SAMPLING pool.{light_normal, particle_row};
 ///         with CELLS pool.{vertex, length, beyond, share, light_share}, vertices; with GUIDE
 ///         pool.{guide, guide_from, guide_light, expected}, guide_keys, guide_full, guide_sums,
@@ -165,6 +208,13 @@ kernel void shade_paths(
 #endif
 #if AOV_FEATURES
     __global float *features,
+#endif
+#if AOV_LIGHTS
+    __global float *choices,
+#endif
+#if AOV_LIGHTS == 2
+    __global const uint *particle_words,
+    __global const uint *particle_counts,
 #endif
 #if SEEN
     __global Seen *seen,
@@ -228,6 +278,9 @@ kernel void shade_paths(
 #if LIGHT_PHOTONS
     last.row = get_u(path, PATH_PARTICLE_ROW);
 #endif
+#if SHADOW_RAYS
+    const Float last_rays = to_float(rays_asked(params RAYS_ARGUMENTS, alive & !camera_ray, depth == 1u, last));
+#endif
 #endif
 
 #if ENVIRONMENT
@@ -235,8 +288,11 @@ kernel void shade_paths(
     if (any_lane(missed)) {
         Float pdf_light;
 #if CONNECT
-        const Float chance = light_chance(params, lights CHOICE_ARGUMENTS, missed & !camera_ray,
-                                          (UInt)(params->environment_light), last);
+        Float chance = light_chance(params, lights CHOICE_ARGUMENTS, missed & !camera_ray,
+                                    (UInt)(params->environment_light), last);
+#if SHADOW_RAYS
+        chance *= last_rays;
+#endif
 #else
         const Float chance = (Float)(0.0f);
 #endif
@@ -272,8 +328,11 @@ kernel void shade_paths(
 #if CONNECT
         const Mask sampled = emits & (s.light != NO_LIGHT);
         const UInt light = pick_u(sampled, s.light, (UInt)(0u));
-        const Float chance =
+        Float chance =
             light_chance(params, lights CHOICE_ARGUMENTS, sampled & !camera_ray, light, last);
+#if SHADOW_RAYS
+        chance *= last_rays;
+#endif
         Float pdf_light =
             area_light_density(lights, light, chance, FIELD(path, PATH_HIT_T), fabs(dot3(s.ng, wo)));
 #if RECTANGLES
@@ -339,6 +398,15 @@ kernel void shade_paths(
         // What a denoiser calls albedo: a metal's reflectance, a dielectric's base colour.
         store_features(params, features, first, hit, sample, pixel, b.base_color, s.ns, FIELD(path, PATH_HIT_T));
     }
+#endif
+
+#if AOV_LIGHTS
+    if (any_lane(alive & camera_ray))
+        store_choice(params,
+#if AOV_LIGHTS == 2
+                     particle_words, particle_counts, (UInt)(NO_PLACE),
+#endif
+                     choices, alive & camera_ray, (Mask)(0), sample, pixel, (Float)(0.0f));
 #endif
 
     Mask goes_on = hit & (depth < params->max_depth);
@@ -525,47 +593,83 @@ kernel void shade_paths(
         query.row = find_row(params, particle_table, asks, near, s.ng);
         put_u(path, PATH_PARTICLE_ROW, query.row);
 #endif
-        const LightChoice choice = choose_light(params, lights CHOICE_ARGUMENTS, asks, query, light_bits);
-        const LightSample light = sample_light(params, lights, surfaces,
-                                               materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS,
-#if ENVIRONMENT == 2
-                                               environment,
-#endif
-                                               asks, above, seed, index, pair, choice);
-        const Vec3 wi_local = vec3(dot3(tangent, light.wi), dot3(bitangent, light.wi), dot3(s.ns, light.wi));
-        Float pdf;
-        const Vec3 f = eval_bsdf(b, chances, wo_local, wi_local, dot3(s.ng, light.wi), &pdf);
-#if GUIDE
-        guide_pdf(guide_cells, guide.known, chances, 0, wi_local GUIDE_TURN, &pdf);
-#endif
-        Float weight = (Float)(1.0f);
-        if (params->direct_sampling == DIRECT_MIS)
-            weight = pick(light.extended, power_heuristic(light.pdf, pdf), weight);
-        else if (params->direct_sampling == DIRECT_BSDF)
-            weight = pick(light.extended, (Float)(0.0f), weight);
-        const Mask lit = asks & (light.pdf > 0.0f);
-        const Vec3 arrives =
-            mul(mul(beta, f), scale(light.radiance, weight / pick(lit, light.pdf, (Float)(1.0f))));
-        put_v(path, PATH_LIGHT_R, pick_v(lit, arrives, zero));
 #if GUIDE
         put_u(path, PATH_GUIDE_FROM, guide_from);
-        FIELD(path, PATH_GUIDE_LIGHT) = luminance(
-            mul(f, scale(light.radiance, weight / pick(lit, light.pdf, (Float)(1.0f)))));
+#endif
+#if SHADOW_RAYS
+        const UInt rays = rays_asked(params RAYS_ARGUMENTS, asks, camera_ray, query);
+        // Rays of a vertex take their lights from as many equal parts of the chances.
+        const UInt part = to_uint(0x1p32f / to_float(max(rays, 2u)));
+        const uint most_rays = SHADOW_RAYS;
+#else
+        const uint most_rays = 1;
+#endif
+        for (uint ray = 0; ray < most_rays; ++ray) {
+#if SHADOW_RAYS
+            const Mask sends = asks & (rays > ray);
+            if (!any_lane(sends))
+                continue;
+            const UInt ray_bits = light_bits + part * ray;
+            const UInt ray_pair =
+                ray == 0u ? pair : PAIR_RAYS + (depth * SHADOW_RAYS + ray) * VERTEX_PAIRS;
+#else
+            const Mask sends = asks;
+            const UInt ray_bits = light_bits;
+            const UInt ray_pair = pair;
+#endif
+            const LightChoice choice = choose_light(params, lights CHOICE_ARGUMENTS, sends, query, ray_bits);
+#if AOV_LIGHTS
+            const Mask shows = sends & camera_ray & (Mask)(ray == 0u ? -1 : 0);
+            if (any_lane(shows))
+                store_choice(params,
+#if AOV_LIGHTS == 2
+                             particle_words, particle_counts, query.row,
+#endif
+                             choices, shows, shows, sample, pixel, choice.pmf);
+#endif
+            LightSample light = sample_light(params, lights, surfaces,
+                                                   materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS,
+#if ENVIRONMENT == 2
+                                                   environment,
+#endif
+                                                   sends, above, seed, index, ray_pair, choice);
+            const Vec3 wi_local = vec3(dot3(tangent, light.wi), dot3(bitangent, light.wi), dot3(s.ns, light.wi));
+            Float pdf;
+            const Vec3 f = eval_bsdf(b, chances, wo_local, wi_local, dot3(s.ng, light.wi), &pdf);
+#if GUIDE
+            guide_pdf(guide_cells, guide.known, chances, 0, wi_local GUIDE_TURN, &pdf);
+#endif
+#if SHADOW_RAYS
+            light.pdf *= to_float(rays);
+#endif
+            Float weight = (Float)(1.0f);
+            if (params->direct_sampling == DIRECT_MIS)
+                weight = pick(light.extended, power_heuristic(light.pdf, pdf), weight);
+            else if (params->direct_sampling == DIRECT_BSDF)
+                weight = pick(light.extended, (Float)(0.0f), weight);
+            const Mask lit = sends & (light.pdf > 0.0f);
+            const Vec3 arrives =
+                mul(mul(beta, f), scale(light.radiance, weight / pick(lit, light.pdf, (Float)(1.0f))));
+            put_v(path, RAY_FIELD(ray, LIGHT_R), pick_v(lit, arrives, zero));
+#if GUIDE
+            FIELD(path, RAY_FIELD(ray, GUIDE_LIGHT)) = luminance(
+                mul(f, scale(light.radiance, weight / pick(lit, light.pdf, (Float)(1.0f)))));
 #endif
 #if CACHE
-        put_v(path, PATH_CACHE_LIGHT_R,
-              mul(mul(cache_gate, f), scale(light.radiance, weight / pick(lit, light.pdf, (Float)(1.0f)))));
+            put_v(path, RAY_FIELD(ray, CACHE_LIGHT_R),
+                  mul(mul(cache_gate, f), scale(light.radiance, weight / pick(lit, light.pdf, (Float)(1.0f)))));
 #endif
 #if CELLS == 2
-        put_v(path, PATH_LIGHT_SHARE_R, pick_v(chosen, base_share(b, chances, base, wi_local, f), share));
+            put_v(path, RAY_FIELD(ray, LIGHT_SHARE_R), pick_v(chosen, base_share(b, chances, base, wi_local, f), share));
 #endif
 #if BASE == 2
-        put_v(path, PATH_BASE_LIGHT_R, pick_v(camera_ray, base_share(b, chances, base, wi_local, f), base_part));
+            put_v(path, RAY_FIELD(ray, BASE_LIGHT_R), pick_v(camera_ray, base_share(b, chances, base, wi_local, f), base_part));
 #endif
-        // On the far side (glass) the ray starts below; the light stays where it is.
-        const Vec3 origin = ray_origin(s, light.wi);
-        put_v(path, PATH_SHADOW_X, origin);
-        put_v(path, PATH_TOWARD_X, add(light.toward, sub(above, origin)));
+            // On the far side (glass) the ray starts below; the light stays where it is.
+            const Vec3 origin = ray_origin(s, light.wi);
+            put_v(path, RAY_FIELD(ray, SHADOW_X), origin);
+            put_v(path, RAY_FIELD(ray, TOWARD_X), add(light.toward, sub(above, origin)));
+        }
     }
 #endif
 

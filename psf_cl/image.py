@@ -26,7 +26,15 @@ _LETTERS_BY_COUNT = {1: "Y", 2: "XY", 3: "RGB", 4: "RGBA"}
 _LETTER_ORDER = "RGBAXYZ"
 
 # Half floats count to 2048 only; these stay float.
-_ALWAYS_FLOAT = ("depth", "samples", "cell_count", "cell_variance", "visits")
+_ALWAYS_FLOAT = (
+    "depth",
+    "samples",
+    "cell_count",
+    "cell_variance",
+    "light_pmf",
+    "photons",
+    "visits",
+)
 _HALF_MAX = 65504.0
 
 # Stats that are the same for the same render, so that equal images are equal files.

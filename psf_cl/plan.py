@@ -288,6 +288,8 @@ def make_plan(
     triangles = shown if levels is None else levels.triangle_count
     corners = _few_corners(scene, shown, traits)
     features = _features(scene, settings, outputs)
+    outputs = _without_light_aovs(outputs, features)
+    features["AOV_LIGHTS"] = _aov_lights(outputs, features["LIGHT_SAMPLING"])
     features["FEW"] = _few(shown, corners, traits)
     features["INSTANCES"] = _instances(levels, shown)
     features["TEMPORAL"] = _temporal(scene, settings, features)
@@ -432,6 +434,7 @@ def _ring(
     """
     planes = 1 + features["AOV_DIRECT"].value + features["AOV_BOUNCES"].value
     planes += 3 * features["AOV_FEATURES"].value
+    planes += bool(features["AOV_LIGHTS"].value)
     planes += 4 * bool(features["SEEN"].value) + bool(features["BASE"].value)
     # With a vertex, what lies behind it, and about one cell: its sums and its key.
     cell_bytes = 16 + 32 + 36 if features["CELLS"].value else 0
@@ -496,6 +499,9 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
     )
     connected = _connect(settings, any(emits(m) for m in materials) or sky, bool(lights))
     rectangles = _rectangles(scene, settings, bool(connected.value))
+    chosen = _light_sampling(
+        settings, bool(connected.value), _light_count(scene, bool(rectangles.value))
+    )
     feature_aovs = outputs & {"albedo", "normal", "depth"}
     return {
         "TEXTURES": switch(
@@ -554,9 +560,8 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             else "the environment is black",
         ),
         "CONNECT": connected,
-        "LIGHT_SAMPLING": _light_sampling(
-            settings, bool(connected.value), _light_count(scene, bool(rectangles.value))
-        ),
+        "LIGHT_SAMPLING": chosen,
+        "SHADOW_RAYS": _shadow_rays(settings, connected, chosen),
         "LENS": _lens(scene),
         "MOTION": _motion(scene),
         "AOV_DIRECT": switch(
@@ -573,6 +578,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "bounces" in outputs, "bounces asked for", "bounces were not asked for"
         ),
         "AOV_GUIDE": _aov_guide(settings, outputs),
+        "AOV_LIGHTS": _aov_lights(outputs, chosen),
         "GUIDE": switch(
             settings.guiding == "learned",
             "guiding is learned",
@@ -664,6 +670,33 @@ def _aov_guide(settings: Settings, outputs: frozenset[str]) -> Feature:
     if not asked:
         return Feature(0, "no image of the guide was asked for")
     return Feature(1, f"{', '.join(asked)} asked for")
+
+
+def _aov_lights(outputs: frozenset[str], chosen: Feature) -> Feature:
+    """Return whether pixels keep how their lights were chosen: 2 with what photons say."""
+    asked = sorted(outputs & {"light_pmf", *photons.VIEWS})
+    if not asked:
+        return Feature(0, "no image of the choice of lights was asked for")
+    return Feature(2 if chosen.value == 2 else 1, f"{', '.join(asked)} asked for")
+
+
+def _without_light_aovs(outputs: frozenset[str], features: dict[str, Feature]) -> frozenset[str]:
+    """Return ``outputs`` without those of choices not made, if all are asked for.
+
+    Raises:
+        InputError: some, not all, are asked for, and one of them is of such a choice.
+    """
+    missing = {}
+    if not features["CONNECT"].value:
+        missing["light_pmf"] = f"a light to choose; {features['CONNECT'].reason}"
+    chosen = features["LIGHT_SAMPLING"]
+    if chosen.value < 2:
+        missing |= dict.fromkeys(photons.VIEWS, f"light_sampling=photon; {chosen.reason}")
+    if outputs >= set(AOVS):
+        return outputs - missing.keys()
+    for name in sorted(outputs & missing.keys()):
+        raise InputError(f"--aov: {name} needs {missing[name]}")
+    return outputs
 
 
 def _sparse(settings: Settings) -> Feature:
@@ -758,6 +791,7 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     # Other lights would be drawn, or other points of them: another image.
     full["LIGHT_SAMPLING"] = features["LIGHT_SAMPLING"]
     full["RECTANGLES"] = features["RECTANGLES"]
+    full["SHADOW_RAYS"] = features["SHADOW_RAYS"]
     # Chains are another integrator, which has no images beside the one.
     full["METROPOLIS"] = features["METROPOLIS"]
     # Directions would be drawn otherwise: the image would have other noise.
@@ -771,6 +805,7 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
             "AOV_CELLS",
             "AOV_DIRECT",
             "AOV_FEATURES",
+            "AOV_LIGHTS",
             "BASE",
             "CELLS",
             "RESTORE",
@@ -812,6 +847,22 @@ def _light_sampling(settings: Settings, connected: bool, lights: int) -> Feature
     if settings.light_sampling == "hierarchy":
         return Feature(1, f"light_sampling is hierarchy: a tree of {lights} lights")
     return Feature(2, f"light_sampling is photon: photons of {lights} lights say which are seen")
+
+
+def _shadow_rays(settings: Settings, connected: Feature, chosen: Feature) -> Feature:
+    """Return how many rays to lights a vertex has at most, 0 for one."""
+    if not connected.value:
+        return Feature(0, connected.reason)
+    if settings.shadow_rays == "1":
+        return Feature(0, "shadow_rays is 1")
+    if settings.shadow_rays != "auto":
+        return Feature(int(settings.shadow_rays), f"shadow_rays is {settings.shadow_rays}")
+    if chosen.value < 2:
+        return Feature(0, "shadow_rays is auto: one, without photons that say how many lights")
+    return Feature(
+        photons.MOST_RAYS,
+        "shadow_rays is auto: from what is seen, one for each light that is known",
+    )
 
 
 def _light_count(scene: Scene, rectangles: bool) -> int:

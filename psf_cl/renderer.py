@@ -529,6 +529,11 @@ class Renderer:
             aovs["albedo"], aovs["normal"], depth = (mean(plane) for plane in sums["film_features"])
             aovs["depth"] = depth[..., :1]
 
+        if "film_choices" in sums:
+            choices = mean(sums["film_choices"][0])
+            for index, name in enumerate((*photons.VIEWS, "light_pmf")):
+                aovs[name] = choices[..., index : index + 1]
+
         def scalar(values: np.ndarray) -> np.ndarray:
             image = np.zeros(width * height, np.float32)
             image[order] = values

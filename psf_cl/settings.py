@@ -38,6 +38,9 @@ AOVS = {
     "guide": "mean direction that the guide draws at the first surface, world space",
     "guide_entropy": "bits of the part that it draws: 6 as without a guide, 0 for one part",
     "visits": "of paths that its cells there learned from",
+    "light_pmf": "mean chance of the light that a shadow ray from the first surface was for",
+    "photons": "photons in the cell that it asked, of light_sampling=photon",
+    "lights": "groups of lights that these came from",
     "gradient": "change of the light since the frame before, 0 to 1, as probes found it",
 }
 
@@ -90,6 +93,13 @@ class Settings:
     )
     photon_floor: float = _number(
         0.2, 1e-3, 1.0, doc="least share of the shadow rays that go where no photon said so"
+    )
+    shadow_rays: str = _choice(
+        "1",
+        *(str(number) for number in range(2, 9)),
+        "auto",
+        doc="rays to lights from each vertex; auto: of the first as many as photons know groups of "
+        "lights, up to 4, of others one",
     )
     direct_sampling: str = _choice(
         "mis", "light", "bsdf", doc="direct light by both strategies, or by one of them alone"
@@ -286,6 +296,7 @@ METROPOLIS_NEEDS = {
     "guiding": "off",
     "path_filter": "off",
     "screen_filter": "off",
+    "shadow_rays": "1",
     "splits": 1,
     "temporal": "off",
 }

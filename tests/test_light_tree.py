@@ -232,11 +232,15 @@ def many_kinds():
     return build(parts, view, (16, 16), lights=lights, environment=0.3)
 
 
-def check_against_table(device, way, sampling):
-    """Compare a choice of lights with that by power; return both images of ``many_kinds``."""
+def check_against_table(device, way, sampling, **settings):
+    """Compare a choice of lights with that by power; return both images of ``many_kinds``.
+
+    Args:
+        settings: of the first image alone.
+    """
     common = {"sampler": "random", "max_depth": 3, "direct_sampling": sampling}
     common["outputs"] = ["variance"]
-    image = render(device, many_kinds(), 256, light_sampling=way, **common)
+    image = render(device, many_kinds(), 256, light_sampling=way, **common, **settings)
     table = render(device, many_kinds(), 1024, light_sampling="power", seed=1, **common)
     z = z_scores(image, table, 4)
     assert np.abs(z).max() < 4.0

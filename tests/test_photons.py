@@ -1,5 +1,7 @@
 """Photons: what becomes of them, and images that do not depend on them."""
 
+import re
+
 import numpy as np
 import planes
 import pytest
@@ -9,10 +11,12 @@ from scipy import stats
 from test_light_tree import check_against_table, many_kinds
 
 from psf_cl.device import layout
+from psf_cl.errors import InputError
 from psf_cl.plan import MANY_LIGHTS, make_plan
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.model import Light
-from psf_cl.settings import Settings
+from psf_cl.settings import AOVS, Settings
+from psf_cl.stages.photons import VIEWS
 
 PLACES = layout.CONSTANT["PARTICLE_PLACES"]
 SIZES = layout.CONSTANT["PARTICLE_SIZES"]
@@ -80,12 +84,112 @@ def test_the_same_photons_leave_the_same_map_and_the_same_image(device, opened):
     again.close()
 
 
-@pytest.mark.parametrize("sampling", ["mis", pytest.param("light", marks=pytest.mark.slow)])
-def test_image_is_the_same_as_with_a_table(device, sampling):
-    guided, _ = check_against_table(device, "photon", sampling)
-    counts = guided.stats["photons"]
-    assert counts["emitted"] == counts["stored"] + counts["escaped"] > 0
-    assert counts["escaped"] > 0  # The sky's photons go past the floor, too.
+def lamps_over_a_floor():
+    """Return a floor under three lamps without extent, of powers 1, 2 and 5."""
+    lights = [
+        Light("point", (power,) * 3, position=(x, 1.0, 0.0))
+        for x, power in ((-0.5, 1.0), (0.0, 2.0), (0.5, 5.0))
+    ]
+    view = camera((0, 3, 0.01), (0, 0, 0), 12)
+    return build([floor(0.2, lambertian(0.5))], view, (8, 8), lights=lights)
+
+
+def test_images_of_the_choice_show_what_a_cell_knows(device):
+    """All of the floor is one cell: every photon that hit it came there, from three groups."""
+    common = {"light_sampling": "photon", "photons": 4096, "photon_cell": 1.0, "max_depth": 1}
+    asked = ["photons", "lights", "light_pmf", "samples", "depth"]
+    opened = open_renderer(device, lamps_over_a_floor(), outputs=asked, **common)
+    opened.render(spp=1)
+    image = opened.image()
+    stored = opened.photon_map.counts()["stored"]
+    opened.close()
+    hit = image.aovs["depth"] > 0.0
+    asked_it = image.aovs["photons"] > 0.0
+    # Points are moved before they ask, some of them out of the cell.
+    assert 0.5 * hit.sum() < asked_it.sum() <= hit.sum() < hit.size and 0 < stored < 4096
+    np.testing.assert_array_equal(image.aovs["photons"], np.where(asked_it, stored, 0.0))
+    np.testing.assert_array_equal(image.aovs["lights"], np.where(asked_it, 3.0, 0.0))
+    assert not asked_it[~hit].any() and set(image.aovs) == {"rgb", *asked}
+
+
+def test_image_of_chances_is_their_mean_over_what_was_drawn(device):
+    """A table draws a light with chance p as often as p says: the mean is the sum of squares."""
+    asked = ["light_pmf", "depth"]
+    common = {"sampler": "random", "max_depth": 1, "outputs": asked}
+    image = render(device, lamps_over_a_floor(), 256, light_sampling="power", **common)
+    hit = image.aovs["depth"] > 0.0
+    chances = np.array([1.0, 2.0, 5.0]) / 8.0
+    error = np.sqrt((chances**3).sum() - (chances**2).sum() ** 2)
+    seen = image.aovs["light_pmf"][hit]
+    error *= 4 / np.sqrt(256 * len(seen))
+    assert seen.mean() == pytest.approx((chances**2).sum(), abs=error)
+    assert np.all(image.aovs["light_pmf"][~hit] == 0.0)
+
+
+@pytest.mark.parametrize(
+    ("names", "settings", "error"),
+    [
+        ("lights", {}, "--aov: lights needs light_sampling=photon; light_sampling is auto"),
+        ("photons", {"light_sampling": "hierarchy"}, "--aov: photons needs light_sampling=photon;"),
+        ("light_pmf", {"max_depth": 0}, "--aov: light_pmf needs a light to choose; max_depth"),
+    ],
+)
+def test_images_of_choices_that_are_not_made_are_refused(names, settings, error):
+    with pytest.raises(InputError, match=re.escape(error)):
+        make_plan(lamps_over_a_floor(), Settings(**settings), [names])
+
+
+def test_images_of_choices_cost_nothing_where_nobody_asks():
+    def kept(outputs, **values):
+        plan = make_plan(lamps_over_a_floor(), Settings(**values), outputs)
+        buffers = {buffer.name for buffer in plan.buffers} & {"choices", "film_choices"}
+        return plan.features["AOV_LIGHTS"].value, buffers, plan.outputs & set(VIEWS)
+
+    both = {"choices", "film_choices"}
+    assert kept(["albedo"], light_sampling="photon") == (0, set(), set())
+    assert kept(["light_pmf"]) == (1, both, set())
+    assert kept(["lights"], light_sampling="photon") == (2, both, {"lights"})
+    # Of all that there are, those are made that this render has.
+    assert kept(AOVS) == (1, both, set())
+    assert kept(AOVS, max_depth=0) == (0, set(), set())
+
+
+@pytest.mark.parametrize(
+    ("sampling", "rays", "direct"),
+    [
+        ("photon", "auto", "mis"),
+        pytest.param("photon", "1", "mis", marks=pytest.mark.slow),
+        pytest.param("photon", "1", "light", marks=pytest.mark.slow),
+        pytest.param("photon", "3", "mis", marks=pytest.mark.slow),
+        pytest.param("hierarchy", "3", "mis", marks=pytest.mark.slow),
+        pytest.param("power", "8", "light", marks=pytest.mark.slow),
+    ],
+)
+def test_image_is_the_same_as_with_one_ray_and_a_table(device, sampling, rays, direct):
+    guided, _ = check_against_table(device, sampling, direct, shadow_rays=rays)
+    if sampling == "photon":
+        counts = guided.stats["photons"]
+        assert counts["emitted"] == counts["stored"] + counts["escaped"] > 0
+        assert counts["escaped"] > 0  # The sky's photons go past the floor, too.
+
+
+def test_rays_are_as_many_as_were_asked_for(device):
+    """Three lamps and four rays: each cell knows three groups of lights."""
+    common = {"max_depth": 1, "photon_cell": 1.0}
+
+    def shadow_rays(**values):
+        return render(device, lamps_over_a_floor(), 4, **common, **values).stats["rays"]["shadow"]
+
+    one = shadow_rays(light_sampling="power", shadow_rays="1")
+    assert 0 < one <= 4 * 64
+    assert shadow_rays(light_sampling="power", shadow_rays="5") == 5 * one
+    assert shadow_rays(light_sampling="power", shadow_rays="auto") == one
+    assert shadow_rays(light_sampling="photon", shadow_rays="auto") == 3 * one
+
+
+def test_chains_have_one_ray_at_a_vertex():
+    with pytest.raises(InputError, match="integrator=metropolis needs shadow_rays=1; got 2"):
+        make_plan(many_kinds(), Settings(integrator="metropolis", shadow_rays="2"))
 
 
 @pytest.mark.slow

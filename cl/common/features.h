@@ -50,6 +50,9 @@
 #error "LIGHT_SAMPLING must be 0 (a table of chances), 1 (a tree of lights) or 2 (photons)"
 #endif
 #define LIGHT_PHOTONS (LIGHT_SAMPLING == 2)
+#ifndef SHADOW_RAYS
+#error "SHADOW_RAYS must be 0 (one at a vertex) or how many at most"
+#endif
 #ifndef LENS
 #error "LENS must be 0 (a pinhole), 1 (a lens) or 2 (parallel rays)"
 #endif
@@ -58,6 +61,9 @@
 #endif
 #ifndef AOV_DIRECT
 #error "AOV_DIRECT must be 0 or 1"
+#endif
+#ifndef AOV_LIGHTS
+#error "AOV_LIGHTS must be 0, 1 (chances of lights) or 2 (and what photons know)"
 #endif
 #ifndef AOV_FEATURES
 #error "AOV_FEATURES must be 0 or 1"

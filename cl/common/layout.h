@@ -62,6 +62,7 @@
 #define HISTORY_SAME_VIEW 4u // the camera has not moved since
 #define GUIDE_SIDE 8u // parts of the hemisphere a side of the square
 #define GUIDE_BINS 64u
+#define RAY_WORDS 19u // of a path, for each shadow ray after the first
 #define PARTICLE_PLACES 64u // of a cell of the map of photons
 #define PARTICLE_KINDS 14u // groups of lights that a cell of it knows at most
 #define PARTICLE_SIZES 3u // of cells of that map, each four times as wide as the one before
@@ -123,68 +124,236 @@
 #else
 #define PATH_END_3 PATH_END_2
 #endif
-#if BASE >= 1
-#define PATH_BASE_R (PATH_END_3 + 0u) // of what goes to the pixel, what the base of the first surface reflected
-#define PATH_BASE_G (PATH_END_3 + 1u)
-#define PATH_BASE_B (PATH_END_3 + 2u)
-#define PATH_END_4 (PATH_END_3 + 3u)
+#if SHADOW_RAYS >= 2
+#define PATH_RAY2_SHADOW_X (PATH_END_3 + 0u) // of shadow ray 2
+#define PATH_RAY2_SHADOW_Y (PATH_END_3 + 1u) // of shadow ray 2
+#define PATH_RAY2_SHADOW_Z (PATH_END_3 + 2u) // of shadow ray 2
+#define PATH_RAY2_TOWARD_X (PATH_END_3 + 3u) // of shadow ray 2
+#define PATH_RAY2_TOWARD_Y (PATH_END_3 + 4u) // of shadow ray 2
+#define PATH_RAY2_TOWARD_Z (PATH_END_3 + 5u) // of shadow ray 2
+#define PATH_RAY2_LIGHT_R (PATH_END_3 + 6u) // of shadow ray 2
+#define PATH_RAY2_LIGHT_G (PATH_END_3 + 7u) // of shadow ray 2
+#define PATH_RAY2_LIGHT_B (PATH_END_3 + 8u) // of shadow ray 2
+#define PATH_RAY2_LIGHT_SHARE_R (PATH_END_3 + 9u) // of shadow ray 2
+#define PATH_RAY2_LIGHT_SHARE_G (PATH_END_3 + 10u) // of shadow ray 2
+#define PATH_RAY2_LIGHT_SHARE_B (PATH_END_3 + 11u) // of shadow ray 2
+#define PATH_RAY2_BASE_LIGHT_R (PATH_END_3 + 12u) // of shadow ray 2
+#define PATH_RAY2_BASE_LIGHT_G (PATH_END_3 + 13u) // of shadow ray 2
+#define PATH_RAY2_BASE_LIGHT_B (PATH_END_3 + 14u) // of shadow ray 2
+#define PATH_RAY2_CACHE_LIGHT_R (PATH_END_3 + 15u) // of shadow ray 2
+#define PATH_RAY2_CACHE_LIGHT_G (PATH_END_3 + 16u) // of shadow ray 2
+#define PATH_RAY2_CACHE_LIGHT_B (PATH_END_3 + 17u) // of shadow ray 2
+#define PATH_RAY2_GUIDE_LIGHT (PATH_END_3 + 18u) // of shadow ray 2
+#define PATH_END_4 (PATH_END_3 + 19u)
 #else
 #define PATH_END_4 PATH_END_3
 #endif
-#if BASE >= 2
-#define PATH_BASE_SHARE_R (PATH_END_4 + 0u) // part of what comes from beyond that surface that its base reflects
-#define PATH_BASE_SHARE_G (PATH_END_4 + 1u)
-#define PATH_BASE_SHARE_B (PATH_END_4 + 2u)
-#define PATH_BASE_LIGHT_R (PATH_END_4 + 3u) // the same of the shadow ray
-#define PATH_BASE_LIGHT_G (PATH_END_4 + 4u)
-#define PATH_BASE_LIGHT_B (PATH_END_4 + 5u)
-#define PATH_END_5 (PATH_END_4 + 6u)
+#if SHADOW_RAYS >= 3
+#define PATH_RAY3_SHADOW_X (PATH_END_4 + 0u) // of shadow ray 3
+#define PATH_RAY3_SHADOW_Y (PATH_END_4 + 1u) // of shadow ray 3
+#define PATH_RAY3_SHADOW_Z (PATH_END_4 + 2u) // of shadow ray 3
+#define PATH_RAY3_TOWARD_X (PATH_END_4 + 3u) // of shadow ray 3
+#define PATH_RAY3_TOWARD_Y (PATH_END_4 + 4u) // of shadow ray 3
+#define PATH_RAY3_TOWARD_Z (PATH_END_4 + 5u) // of shadow ray 3
+#define PATH_RAY3_LIGHT_R (PATH_END_4 + 6u) // of shadow ray 3
+#define PATH_RAY3_LIGHT_G (PATH_END_4 + 7u) // of shadow ray 3
+#define PATH_RAY3_LIGHT_B (PATH_END_4 + 8u) // of shadow ray 3
+#define PATH_RAY3_LIGHT_SHARE_R (PATH_END_4 + 9u) // of shadow ray 3
+#define PATH_RAY3_LIGHT_SHARE_G (PATH_END_4 + 10u) // of shadow ray 3
+#define PATH_RAY3_LIGHT_SHARE_B (PATH_END_4 + 11u) // of shadow ray 3
+#define PATH_RAY3_BASE_LIGHT_R (PATH_END_4 + 12u) // of shadow ray 3
+#define PATH_RAY3_BASE_LIGHT_G (PATH_END_4 + 13u) // of shadow ray 3
+#define PATH_RAY3_BASE_LIGHT_B (PATH_END_4 + 14u) // of shadow ray 3
+#define PATH_RAY3_CACHE_LIGHT_R (PATH_END_4 + 15u) // of shadow ray 3
+#define PATH_RAY3_CACHE_LIGHT_G (PATH_END_4 + 16u) // of shadow ray 3
+#define PATH_RAY3_CACHE_LIGHT_B (PATH_END_4 + 17u) // of shadow ray 3
+#define PATH_RAY3_GUIDE_LIGHT (PATH_END_4 + 18u) // of shadow ray 3
+#define PATH_END_5 (PATH_END_4 + 19u)
 #else
 #define PATH_END_5 PATH_END_4
 #endif
-#if CELLS >= 1
-#define PATH_VERTEX (PATH_END_5 + 0u) // uint; 1 + depth of the vertex behind which light is shared, VERTEX_NEAR; 0: none
-#define PATH_LENGTH (PATH_END_5 + 1u) // m, from the camera on
-#define PATH_BEYOND_R (PATH_END_5 + 2u) // of what was gathered, what is shared: it came from beyond that vertex
-#define PATH_BEYOND_G (PATH_END_5 + 3u)
-#define PATH_BEYOND_B (PATH_END_5 + 4u)
-#define PATH_END_6 (PATH_END_5 + 5u)
+#if SHADOW_RAYS >= 4
+#define PATH_RAY4_SHADOW_X (PATH_END_5 + 0u) // of shadow ray 4
+#define PATH_RAY4_SHADOW_Y (PATH_END_5 + 1u) // of shadow ray 4
+#define PATH_RAY4_SHADOW_Z (PATH_END_5 + 2u) // of shadow ray 4
+#define PATH_RAY4_TOWARD_X (PATH_END_5 + 3u) // of shadow ray 4
+#define PATH_RAY4_TOWARD_Y (PATH_END_5 + 4u) // of shadow ray 4
+#define PATH_RAY4_TOWARD_Z (PATH_END_5 + 5u) // of shadow ray 4
+#define PATH_RAY4_LIGHT_R (PATH_END_5 + 6u) // of shadow ray 4
+#define PATH_RAY4_LIGHT_G (PATH_END_5 + 7u) // of shadow ray 4
+#define PATH_RAY4_LIGHT_B (PATH_END_5 + 8u) // of shadow ray 4
+#define PATH_RAY4_LIGHT_SHARE_R (PATH_END_5 + 9u) // of shadow ray 4
+#define PATH_RAY4_LIGHT_SHARE_G (PATH_END_5 + 10u) // of shadow ray 4
+#define PATH_RAY4_LIGHT_SHARE_B (PATH_END_5 + 11u) // of shadow ray 4
+#define PATH_RAY4_BASE_LIGHT_R (PATH_END_5 + 12u) // of shadow ray 4
+#define PATH_RAY4_BASE_LIGHT_G (PATH_END_5 + 13u) // of shadow ray 4
+#define PATH_RAY4_BASE_LIGHT_B (PATH_END_5 + 14u) // of shadow ray 4
+#define PATH_RAY4_CACHE_LIGHT_R (PATH_END_5 + 15u) // of shadow ray 4
+#define PATH_RAY4_CACHE_LIGHT_G (PATH_END_5 + 16u) // of shadow ray 4
+#define PATH_RAY4_CACHE_LIGHT_B (PATH_END_5 + 17u) // of shadow ray 4
+#define PATH_RAY4_GUIDE_LIGHT (PATH_END_5 + 18u) // of shadow ray 4
+#define PATH_END_6 (PATH_END_5 + 19u)
 #else
 #define PATH_END_6 PATH_END_5
 #endif
-#if CELLS >= 2
-#define PATH_SHARE_R (PATH_END_6 + 0u) // part of what comes from beyond the vertex that its diffuse base reflects
-#define PATH_SHARE_G (PATH_END_6 + 1u)
-#define PATH_SHARE_B (PATH_END_6 + 2u)
-#define PATH_LIGHT_SHARE_R (PATH_END_6 + 3u) // the same of the shadow ray
-#define PATH_LIGHT_SHARE_G (PATH_END_6 + 4u)
-#define PATH_LIGHT_SHARE_B (PATH_END_6 + 5u)
-#define PATH_END_7 (PATH_END_6 + 6u)
+#if SHADOW_RAYS >= 5
+#define PATH_RAY5_SHADOW_X (PATH_END_6 + 0u) // of shadow ray 5
+#define PATH_RAY5_SHADOW_Y (PATH_END_6 + 1u) // of shadow ray 5
+#define PATH_RAY5_SHADOW_Z (PATH_END_6 + 2u) // of shadow ray 5
+#define PATH_RAY5_TOWARD_X (PATH_END_6 + 3u) // of shadow ray 5
+#define PATH_RAY5_TOWARD_Y (PATH_END_6 + 4u) // of shadow ray 5
+#define PATH_RAY5_TOWARD_Z (PATH_END_6 + 5u) // of shadow ray 5
+#define PATH_RAY5_LIGHT_R (PATH_END_6 + 6u) // of shadow ray 5
+#define PATH_RAY5_LIGHT_G (PATH_END_6 + 7u) // of shadow ray 5
+#define PATH_RAY5_LIGHT_B (PATH_END_6 + 8u) // of shadow ray 5
+#define PATH_RAY5_LIGHT_SHARE_R (PATH_END_6 + 9u) // of shadow ray 5
+#define PATH_RAY5_LIGHT_SHARE_G (PATH_END_6 + 10u) // of shadow ray 5
+#define PATH_RAY5_LIGHT_SHARE_B (PATH_END_6 + 11u) // of shadow ray 5
+#define PATH_RAY5_BASE_LIGHT_R (PATH_END_6 + 12u) // of shadow ray 5
+#define PATH_RAY5_BASE_LIGHT_G (PATH_END_6 + 13u) // of shadow ray 5
+#define PATH_RAY5_BASE_LIGHT_B (PATH_END_6 + 14u) // of shadow ray 5
+#define PATH_RAY5_CACHE_LIGHT_R (PATH_END_6 + 15u) // of shadow ray 5
+#define PATH_RAY5_CACHE_LIGHT_G (PATH_END_6 + 16u) // of shadow ray 5
+#define PATH_RAY5_CACHE_LIGHT_B (PATH_END_6 + 17u) // of shadow ray 5
+#define PATH_RAY5_GUIDE_LIGHT (PATH_END_6 + 18u) // of shadow ray 5
+#define PATH_END_7 (PATH_END_6 + 19u)
 #else
 #define PATH_END_7 PATH_END_6
 #endif
-#if CACHE >= 1
-#define PATH_CACHE (PATH_END_7 + 0u) // uint; cell that the path learns for; NO_SLOT: none
-#define PATH_CACHE_GATE_R (PATH_END_7 + 1u) // part of light from here that it reflects, over its reflectance
-#define PATH_CACHE_GATE_G (PATH_END_7 + 2u)
-#define PATH_CACHE_GATE_B (PATH_END_7 + 3u)
-#define PATH_CACHE_LIGHT_R (PATH_END_7 + 4u) // what arrives through the shadow ray, by the same measure
-#define PATH_CACHE_LIGHT_G (PATH_END_7 + 5u)
-#define PATH_CACHE_LIGHT_B (PATH_END_7 + 6u)
-#define PATH_END_8 (PATH_END_7 + 7u)
+#if SHADOW_RAYS >= 6
+#define PATH_RAY6_SHADOW_X (PATH_END_7 + 0u) // of shadow ray 6
+#define PATH_RAY6_SHADOW_Y (PATH_END_7 + 1u) // of shadow ray 6
+#define PATH_RAY6_SHADOW_Z (PATH_END_7 + 2u) // of shadow ray 6
+#define PATH_RAY6_TOWARD_X (PATH_END_7 + 3u) // of shadow ray 6
+#define PATH_RAY6_TOWARD_Y (PATH_END_7 + 4u) // of shadow ray 6
+#define PATH_RAY6_TOWARD_Z (PATH_END_7 + 5u) // of shadow ray 6
+#define PATH_RAY6_LIGHT_R (PATH_END_7 + 6u) // of shadow ray 6
+#define PATH_RAY6_LIGHT_G (PATH_END_7 + 7u) // of shadow ray 6
+#define PATH_RAY6_LIGHT_B (PATH_END_7 + 8u) // of shadow ray 6
+#define PATH_RAY6_LIGHT_SHARE_R (PATH_END_7 + 9u) // of shadow ray 6
+#define PATH_RAY6_LIGHT_SHARE_G (PATH_END_7 + 10u) // of shadow ray 6
+#define PATH_RAY6_LIGHT_SHARE_B (PATH_END_7 + 11u) // of shadow ray 6
+#define PATH_RAY6_BASE_LIGHT_R (PATH_END_7 + 12u) // of shadow ray 6
+#define PATH_RAY6_BASE_LIGHT_G (PATH_END_7 + 13u) // of shadow ray 6
+#define PATH_RAY6_BASE_LIGHT_B (PATH_END_7 + 14u) // of shadow ray 6
+#define PATH_RAY6_CACHE_LIGHT_R (PATH_END_7 + 15u) // of shadow ray 6
+#define PATH_RAY6_CACHE_LIGHT_G (PATH_END_7 + 16u) // of shadow ray 6
+#define PATH_RAY6_CACHE_LIGHT_B (PATH_END_7 + 17u) // of shadow ray 6
+#define PATH_RAY6_GUIDE_LIGHT (PATH_END_7 + 18u) // of shadow ray 6
+#define PATH_END_8 (PATH_END_7 + 19u)
 #else
 #define PATH_END_8 PATH_END_7
 #endif
-#if GUIDE >= 1
-#define PATH_GUIDE (PATH_END_8 + 0u) // uint; part of the guide's cell that the ray left through; NO_PART: none
-#define PATH_GUIDE_FROM (PATH_END_8 + 1u) // uint; that of the ray before the shadow ray
-#define PATH_EXPECTED (PATH_END_8 + 2u) // luminance at the camera that the first vertex was expected to reflect
-#define PATH_GUIDE_LIGHT (PATH_END_8 + 3u) // luminance that arrives through the shadow ray, reflected along that
-#define PATH_END_9 (PATH_END_8 + 4u)
+#if SHADOW_RAYS >= 7
+#define PATH_RAY7_SHADOW_X (PATH_END_8 + 0u) // of shadow ray 7
+#define PATH_RAY7_SHADOW_Y (PATH_END_8 + 1u) // of shadow ray 7
+#define PATH_RAY7_SHADOW_Z (PATH_END_8 + 2u) // of shadow ray 7
+#define PATH_RAY7_TOWARD_X (PATH_END_8 + 3u) // of shadow ray 7
+#define PATH_RAY7_TOWARD_Y (PATH_END_8 + 4u) // of shadow ray 7
+#define PATH_RAY7_TOWARD_Z (PATH_END_8 + 5u) // of shadow ray 7
+#define PATH_RAY7_LIGHT_R (PATH_END_8 + 6u) // of shadow ray 7
+#define PATH_RAY7_LIGHT_G (PATH_END_8 + 7u) // of shadow ray 7
+#define PATH_RAY7_LIGHT_B (PATH_END_8 + 8u) // of shadow ray 7
+#define PATH_RAY7_LIGHT_SHARE_R (PATH_END_8 + 9u) // of shadow ray 7
+#define PATH_RAY7_LIGHT_SHARE_G (PATH_END_8 + 10u) // of shadow ray 7
+#define PATH_RAY7_LIGHT_SHARE_B (PATH_END_8 + 11u) // of shadow ray 7
+#define PATH_RAY7_BASE_LIGHT_R (PATH_END_8 + 12u) // of shadow ray 7
+#define PATH_RAY7_BASE_LIGHT_G (PATH_END_8 + 13u) // of shadow ray 7
+#define PATH_RAY7_BASE_LIGHT_B (PATH_END_8 + 14u) // of shadow ray 7
+#define PATH_RAY7_CACHE_LIGHT_R (PATH_END_8 + 15u) // of shadow ray 7
+#define PATH_RAY7_CACHE_LIGHT_G (PATH_END_8 + 16u) // of shadow ray 7
+#define PATH_RAY7_CACHE_LIGHT_B (PATH_END_8 + 17u) // of shadow ray 7
+#define PATH_RAY7_GUIDE_LIGHT (PATH_END_8 + 18u) // of shadow ray 7
+#define PATH_END_9 (PATH_END_8 + 19u)
 #else
 #define PATH_END_9 PATH_END_8
 #endif
-#define PATH_FIELD_COUNT PATH_END_9
+#if SHADOW_RAYS >= 8
+#define PATH_RAY8_SHADOW_X (PATH_END_9 + 0u) // of shadow ray 8
+#define PATH_RAY8_SHADOW_Y (PATH_END_9 + 1u) // of shadow ray 8
+#define PATH_RAY8_SHADOW_Z (PATH_END_9 + 2u) // of shadow ray 8
+#define PATH_RAY8_TOWARD_X (PATH_END_9 + 3u) // of shadow ray 8
+#define PATH_RAY8_TOWARD_Y (PATH_END_9 + 4u) // of shadow ray 8
+#define PATH_RAY8_TOWARD_Z (PATH_END_9 + 5u) // of shadow ray 8
+#define PATH_RAY8_LIGHT_R (PATH_END_9 + 6u) // of shadow ray 8
+#define PATH_RAY8_LIGHT_G (PATH_END_9 + 7u) // of shadow ray 8
+#define PATH_RAY8_LIGHT_B (PATH_END_9 + 8u) // of shadow ray 8
+#define PATH_RAY8_LIGHT_SHARE_R (PATH_END_9 + 9u) // of shadow ray 8
+#define PATH_RAY8_LIGHT_SHARE_G (PATH_END_9 + 10u) // of shadow ray 8
+#define PATH_RAY8_LIGHT_SHARE_B (PATH_END_9 + 11u) // of shadow ray 8
+#define PATH_RAY8_BASE_LIGHT_R (PATH_END_9 + 12u) // of shadow ray 8
+#define PATH_RAY8_BASE_LIGHT_G (PATH_END_9 + 13u) // of shadow ray 8
+#define PATH_RAY8_BASE_LIGHT_B (PATH_END_9 + 14u) // of shadow ray 8
+#define PATH_RAY8_CACHE_LIGHT_R (PATH_END_9 + 15u) // of shadow ray 8
+#define PATH_RAY8_CACHE_LIGHT_G (PATH_END_9 + 16u) // of shadow ray 8
+#define PATH_RAY8_CACHE_LIGHT_B (PATH_END_9 + 17u) // of shadow ray 8
+#define PATH_RAY8_GUIDE_LIGHT (PATH_END_9 + 18u) // of shadow ray 8
+#define PATH_END_10 (PATH_END_9 + 19u)
+#else
+#define PATH_END_10 PATH_END_9
+#endif
+#if BASE >= 1
+#define PATH_BASE_R (PATH_END_10 + 0u) // of what goes to the pixel, what the base of the first surface reflected
+#define PATH_BASE_G (PATH_END_10 + 1u)
+#define PATH_BASE_B (PATH_END_10 + 2u)
+#define PATH_END_11 (PATH_END_10 + 3u)
+#else
+#define PATH_END_11 PATH_END_10
+#endif
+#if BASE >= 2
+#define PATH_BASE_SHARE_R (PATH_END_11 + 0u) // part of what comes from beyond that surface that its base reflects
+#define PATH_BASE_SHARE_G (PATH_END_11 + 1u)
+#define PATH_BASE_SHARE_B (PATH_END_11 + 2u)
+#define PATH_BASE_LIGHT_R (PATH_END_11 + 3u) // the same of the shadow ray
+#define PATH_BASE_LIGHT_G (PATH_END_11 + 4u)
+#define PATH_BASE_LIGHT_B (PATH_END_11 + 5u)
+#define PATH_END_12 (PATH_END_11 + 6u)
+#else
+#define PATH_END_12 PATH_END_11
+#endif
+#if CELLS >= 1
+#define PATH_VERTEX (PATH_END_12 + 0u) // uint; 1 + depth of the vertex behind which light is shared, VERTEX_NEAR; 0: none
+#define PATH_LENGTH (PATH_END_12 + 1u) // m, from the camera on
+#define PATH_BEYOND_R (PATH_END_12 + 2u) // of what was gathered, what is shared: it came from beyond that vertex
+#define PATH_BEYOND_G (PATH_END_12 + 3u)
+#define PATH_BEYOND_B (PATH_END_12 + 4u)
+#define PATH_END_13 (PATH_END_12 + 5u)
+#else
+#define PATH_END_13 PATH_END_12
+#endif
+#if CELLS >= 2
+#define PATH_SHARE_R (PATH_END_13 + 0u) // part of what comes from beyond the vertex that its diffuse base reflects
+#define PATH_SHARE_G (PATH_END_13 + 1u)
+#define PATH_SHARE_B (PATH_END_13 + 2u)
+#define PATH_LIGHT_SHARE_R (PATH_END_13 + 3u) // the same of the shadow ray
+#define PATH_LIGHT_SHARE_G (PATH_END_13 + 4u)
+#define PATH_LIGHT_SHARE_B (PATH_END_13 + 5u)
+#define PATH_END_14 (PATH_END_13 + 6u)
+#else
+#define PATH_END_14 PATH_END_13
+#endif
+#if CACHE >= 1
+#define PATH_CACHE (PATH_END_14 + 0u) // uint; cell that the path learns for; NO_SLOT: none
+#define PATH_CACHE_GATE_R (PATH_END_14 + 1u) // part of light from here that it reflects, over its reflectance
+#define PATH_CACHE_GATE_G (PATH_END_14 + 2u)
+#define PATH_CACHE_GATE_B (PATH_END_14 + 3u)
+#define PATH_CACHE_LIGHT_R (PATH_END_14 + 4u) // what arrives through the shadow ray, by the same measure
+#define PATH_CACHE_LIGHT_G (PATH_END_14 + 5u)
+#define PATH_CACHE_LIGHT_B (PATH_END_14 + 6u)
+#define PATH_END_15 (PATH_END_14 + 7u)
+#else
+#define PATH_END_15 PATH_END_14
+#endif
+#if GUIDE >= 1
+#define PATH_GUIDE (PATH_END_15 + 0u) // uint; part of the guide's cell that the ray left through; NO_PART: none
+#define PATH_GUIDE_FROM (PATH_END_15 + 1u) // uint; that of the ray before the shadow ray
+#define PATH_EXPECTED (PATH_END_15 + 2u) // luminance at the camera that the first vertex was expected to reflect
+#define PATH_GUIDE_LIGHT (PATH_END_15 + 3u) // luminance that arrives through the shadow ray, reflected along that
+#define PATH_END_16 (PATH_END_15 + 4u)
+#else
+#define PATH_END_16 PATH_END_15
+#endif
+#define PATH_FIELD_COUNT PATH_END_16
 
 #define CHAIN_KNOWN 0u // uint; pairs of numbers of the state from which the path starts; 0: a large step
 #define CHAIN_PAIRS 1u // uint; pairs of numbers that the state has
@@ -276,6 +445,7 @@ typedef struct {
     uint node_bits; // that a node of the tree of lights takes
     uint particle_cells; // of the map of photons, a power of two
     float particle_cell; // edge of a cell, m per m from the camera
+    uint shadow_rays; // of each vertex; 0: as many as its photons ask for
     float photon_floor; // chance that a light is drawn whatever photons say
     uint environment_width; // texels
     uint environment_height; // texels
@@ -326,7 +496,7 @@ typedef struct {
     float cache_steps; // fixed-point steps of a sum of radiance per unit, a power of two
     float cache_limit; // radiance from which a sample is too large for these sums
     float cache_trace; // least chance that a path goes on where a cell is known
-    uint pad[3]; // fills the record
+    uint pad[2]; // fills the record
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.

@@ -331,6 +331,32 @@ static inline Float light_chance(
 #endif
 }
 
+#if SHADOW_RAYS
+// What the number of shadow rays depends on.
+#if LIGHT_PHOTONS
+#define RAYS_PARAMETERS , __global const uint *particle_table
+#define RAYS_ARGUMENTS , particle_table
+#else
+#define RAYS_PARAMETERS
+#define RAYS_ARGUMENTS
+#endif
+
+/// Return how many shadow rays a vertex sends: of `auto` the first one as many as its cell knows groups of
+/// lights, and the others one.
+static inline UInt rays_asked(__global const Params *params RAYS_PARAMETERS, Mask active, Mask is_first, LightQuery q)
+{
+#if LIGHT_PHOTONS
+    if (params->shadow_rays == 0u) {
+        const Mask known = active & (q.row != NO_PLACE);
+        const UInt length = record_word(particle_table, pick_u(known, q.row, (UInt)(0u)), RECORD_LENGTH);
+        const UInt most = pick_u(is_first, (UInt)(SHADOW_RAYS), (UInt)(1u));
+        return pick_u(known, clamp(length, (UInt)(1u), most), most);
+    }
+#endif
+    return (UInt)(params->shadow_rays);
+}
+#endif
+
 /// Draw a direction to the light that was chosen, for rays that start at `origin`.
 ///
 /// pdf is 0 where nothing arrives.  `seed`, `reversed_index` and `pair` (the vertex's first) name the numbers.

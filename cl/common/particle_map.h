@@ -117,6 +117,19 @@ static inline uint main_cell(
     return best;
 }
 
+/// Return how many particles came to the main cell of a row of places; `*kinds`: to how many places of it.
+static inline uint count_in_row(
+    __global const Params *params, __global const uint *words, __global const uint *counts, uint row, uint *kinds)
+{
+    uint total;
+    const uint base = row * PARTICLE_PLACES;
+    const uint print = main_cell(params, words, counts, base, &total);
+    *kinds = 0;
+    for (uint i = base; i < base + PARTICLE_PLACES; ++i)
+        *kinds += counts[i] > 0 && words[i] >> params->node_bits == print;
+    return total;
+}
+
 /// Make the record of a row of places: of the cell in it that most particles came to.
 ///
 /// Of its nodes those stay that most came from; what the others had is kept for any light.  How likely news

@@ -16,6 +16,13 @@ static inline __global Float *pool_at(__global float *pool, uint item)
 // One field of these paths: readable and writable.
 #define FIELD(path, field) (path)[(field) * ITEMS_PER_BLOCK]
 
+// A field of a shadow ray, the first of which has number 0.
+#if SHADOW_RAYS
+#define RAY_FIELD(ray, field) ((ray) == 0u ? PATH_##field : PATH_RAY2_##field + ((ray) - 1u) * RAY_WORDS)
+#else
+#define RAY_FIELD(ray, field) PATH_##field
+#endif
+
 static inline UInt get_u(__global Float *path, uint field) { return as_bits(FIELD(path, field)); }
 static inline void put_u(__global Float *path, uint field, UInt value) { FIELD(path, field) = from_bits(value); }
 static inline Vec3 get_v(__global Float *path, uint field)

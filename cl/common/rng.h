@@ -10,6 +10,8 @@
 #define PAIR_LENS 1u
 // From here on by depth: where a vertex is moved to before it looks for photons.
 #define PAIR_PARTICLES 0xff000000u
+// From here on by depth and number: all pairs of a vertex's shadow rays after the first.
+#define PAIR_RAYS 0xc0000000u
 #define PAIR_BSDF 0u
 #define PAIR_LIGHT 1u
 #define PAIR_CHOICE 2u      // which lobe, then whether to go on; which light

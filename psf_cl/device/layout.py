@@ -96,6 +96,7 @@ PARAMS = Record(
     uint node_bits - that a node of the tree of lights takes
     uint particle_cells - of the map of photons, a power of two
     float particle_cell - edge of a cell, m per m from the camera
+    uint shadow_rays - of each vertex; 0: as many as its photons ask for
     float photon_floor - chance that a light is drawn whatever photons say
     uint environment_width - texels
     uint environment_height - texels
@@ -733,6 +734,25 @@ PATH_FIELDS = (
     ("light_b", ""),
 )
 
+#: Most shadow rays of a vertex.
+MOST_SHADOW_RAYS = 8
+
+#: Words of each shadow ray of a vertex after the first: what the first has, in this order, also if
+#: the features are off that ask for it.
+RAY_FIELDS = tuple(
+    f"{name}_{axis}" if axis else name
+    for name, axes in (
+        ("shadow", "xyz"),
+        ("toward", "xyz"),
+        ("light", "rgb"),
+        ("light_share", "rgb"),
+        ("base_light", "rgb"),
+        ("cache_light", "rgb"),
+        ("guide_light", " "),
+    )
+    for axis in axes.strip() or [""]
+)
+
 #: Words that only paths of some features have: (feature, least value of it, words).
 OPTIONAL_PATH_FIELDS = (
     (
@@ -754,6 +774,14 @@ OPTIONAL_PATH_FIELDS = (
         "LIGHT_SAMPLING",
         2,
         (("particle_row", "uint; row of the table of photons that it was chosen by"),),
+    ),
+    *(
+        (
+            "SHADOW_RAYS",
+            ray,
+            tuple((f"ray{ray}_{name}", f"of shadow ray {ray}") for name in RAY_FIELDS),
+        )
+        for ray in range(2, MOST_SHADOW_RAYS + 1)
     ),
     (
         "BASE",
@@ -969,6 +997,7 @@ CONSTANTS = (
     ("HISTORY_SAME_VIEW", 4, "the camera has not moved since"),
     ("GUIDE_SIDE", GUIDE_SIDE, "parts of the hemisphere a side of the square"),
     ("GUIDE_BINS", GUIDE_SIDE**2, ""),
+    ("RAY_WORDS", len(RAY_FIELDS), "of a path, for each shadow ray after the first"),
     ("PARTICLE_PLACES", 64, "of a cell of the map of photons"),
     ("PARTICLE_KINDS", 14, "groups of lights that a cell of it knows at most"),
     ("PARTICLE_SIZES", 3, "of cells of that map, each four times as wide as the one before"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from psf_cl.stages.shade import RAY_BYTES
 from psf_cl.stages.spec import POOL_FLAGS, Context, KernelSpec, StageSpec
 
 
@@ -41,6 +42,7 @@ def plan(context: Context) -> StageSpec | None:
         "connect_lights",
         reads=tuple(dict.fromkeys(reads)),
         writes=("light", "radiance", *direct[:1], *base, *shared),
+        record_bytes=RAY_BYTES * max(context.features["SHADOW_RAYS"].value - 1, 0),
         rays=("shadow",),
         runs=True,
     )

@@ -14,6 +14,7 @@ PLANES = (
     ("bounces", "film_bounces", 1),
     ("base", "film_base", 1),
     ("features", "film_features", 3),
+    ("choices", "film_choices", 1),
 )
 
 #: Depths that the occupancy statistics tell apart; the last takes all beyond.
@@ -41,8 +42,12 @@ def plan(context: Context) -> StageSpec:
         buffers.append(
             BufferSpec("film_features", dtype, count, "sums of albedo, normal and depth")
         )
+    if context.on("AOV_LIGHTS"):
+        what = "sums of how lights were chosen"
+        buffers.append(BufferSpec("film_choices", dtype, context.pixel_count, what))
     planes = 1 + context.on("AOV_DIRECT") + context.on("BASE") + 3 * context.on("AOV_FEATURES")
     planes += context.on("AOV_BOUNCES")
+    planes += context.on("AOV_LIGHTS")
     # A weighted value; the sums are read and written.
     sample_bytes = planes * (16 + 2 * dtype.itemsize)
     kernels = [

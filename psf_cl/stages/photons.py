@@ -23,6 +23,12 @@ FEWEST, MOST = 1 << 14, 1 << 20
 #: Cells of the map, a power of two.
 CELLS = 1 << 15
 
+#: Shadow rays of a vertex at most by ``shadow_rays=auto``.
+MOST_RAYS = 4
+
+#: AOVs of what photons know.
+VIEWS = ("photons", "lights")
+
 PLACES = layout.CONSTANT["PARTICLE_PLACES"]
 
 #: Words of what the table knows of a cell.
@@ -40,6 +46,7 @@ def parameters(settings: Settings, light_count: int) -> dict[str, object]:
     """Return what the kernels need to know, by the names of ``layout.PARAMS``."""
     return {
         "node_bits": max(2 * light_count - 1, 0).bit_length(),
+        "shadow_rays": 0 if settings.shadow_rays == "auto" else int(settings.shadow_rays),
         "particle_cells": CELLS,
         "particle_cell": settings.photon_cell,
         "photon_floor": settings.photon_floor,

@@ -7,6 +7,9 @@ import numpy as np
 from psf_cl.device import layout
 from psf_cl.stages.spec import POOL_FLAGS, BufferSpec, Context, KernelSpec, StageSpec
 
+#: Of each shadow ray after the first that is written here and read by the connecting stage.
+RAY_BYTES = 36
+
 
 def plan(context: Context) -> StageSpec:
     """Return the stage; every render has it."""
@@ -22,6 +25,10 @@ def plan(context: Context) -> StageSpec:
                 passing=True,
             )
         )
+    if context.on("AOV_LIGHTS"):
+        count = context.ring * context.pixel_count * 4
+        what = "how lights were chosen, of passes in flight"
+        buffers.append(BufferSpec("choices", np.dtype(np.float32), count, what, passing=True))
     return StageSpec(
         "shade",
         "every hit and miss is shaded",
@@ -43,6 +50,7 @@ def plan(context: Context) -> StageSpec:
             "CONNECT",
             "AOV_DIRECT",
             "AOV_FEATURES",
+            "AOV_LIGHTS",
             "MOTION",
             "SEEN",
             *POOL_FLAGS,
@@ -105,6 +113,8 @@ def _kernel(context: Context) -> KernelSpec:
     if context.on("CACHE"):
         records += [layout.CACHE_CELL, layout.CACHE_SUM]
     feature_bytes = 3 * 16 if context.on("AOV_FEATURES") else 0
+    feature_bytes += RAY_BYTES * max(context.features["SHADOW_RAYS"].value - 1, 0)
+    feature_bytes += 16 if context.on("AOV_LIGHTS") else 0
     return KernelSpec(
         "shade_paths",
         reads=(*walk, *(("origin",) if chosen else ()), "hit", "sample", "pixel", "seed"),
