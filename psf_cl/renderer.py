@@ -20,12 +20,13 @@ from psf_cl import __version__, learned, motion, tables
 from psf_cl.chains import Chains
 from psf_cl.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
 from psf_cl.device import layout
+from psf_cl.device.builders import Wanted, build_programs, builders_for
 from psf_cl.device.bvh import MIN_STACK_SIZE, Bvh, Refit, build_bvh, warm_up_builder
 from psf_cl.device.device import Buffer, Device, open_device
 from psf_cl.device.hash_map import buckets_of
 from psf_cl.device.light_tree import LightTree, warm_up_light_tree
 from psf_cl.device.primitives import Primitives
-from psf_cl.device.program import Launch, Program, load_program
+from psf_cl.device.program import Launch, Program
 from psf_cl.device.sources import source_digest
 from psf_cl.device.two_levels import build_two_levels
 from psf_cl.errors import DeviceError, InputError, NoRoomError
@@ -1158,15 +1159,16 @@ class Renderer:
     def _compile(self, stack_size: int) -> dict[str, Program]:
         """Build the stages' programs, down to machine code; runs beside the scene's loading."""
         start = time.perf_counter()
-        programs = {}
+        wanted = {}
         for stage in self.running.stages:
             if stage.per_frame:
                 continue
             defines = self.running.defines(stage)
             if stage.traces:
                 defines |= {"STACK_SIZE": stack_size}
-            programs[stage.name] = load_program(self.device, stage.source, defines)
-            programs[stage.name].warm_up(*stage.kernel_names)
+            wanted[stage.name] = Wanted(stage.source, defines, stage.kernel_names)
+        built = build_programs(self.device, list(wanted.values()))
+        programs = dict(zip(wanted, built, strict=True))
         self.compile_seconds += time.perf_counter() - start
         return programs
 
@@ -1362,6 +1364,7 @@ def prepare_device(
             small one that needs no tree, and the builder is left to the renderer.
     """
     device = open_device(text, profiling=profiling)
+    device.builders = builders_for(device)
     if read is None or not read.is_set():
         warm_up_builder(device)
     return device

@@ -60,6 +60,7 @@ class Device:
 
     Attributes:
         traits: what the kernels are specialised to.
+        builders: processes that may build programs beside this one.
         profiling: whether every command keeps its event until it is collected.
         totals: what was spent on each kernel so far, by its name (profiling only).
         on_intervals: called with the commands that are done, each time that they are collected.
@@ -69,6 +70,7 @@ class Device:
         self.context = context
         self.cl_device = context.devices[0]
         self.traits = traits
+        self.builders = 0
         self.profiling = profiling
         flags = cl.command_queue_properties.PROFILING_ENABLE if profiling else 0
         self.queue = cl.CommandQueue(self.context, properties=flags)

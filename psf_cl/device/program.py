@@ -48,6 +48,9 @@ def assemble(file: str, folder: Path | None = None) -> str:
         lines = [f'#line 1 "{shown}"']
         conditions = 0
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+            if "#" not in line:
+                lines.append(line if line.strip() else "")
+                continue
             conditions += bool(re.match(r"\s*#\s*if", line)) - bool(re.match(r"\s*#\s*endif", line))
             match = _INCLUDE.match(line)
             if match and conditions:
@@ -75,6 +78,7 @@ class Program:
     Attributes:
         file: the ``.cl`` file.
         defines: every macro that it was built with.
+        is_warm: whether it was warmed up.
         seconds: that building took, down to machine code where it was warmed up.
     """
 
@@ -98,6 +102,7 @@ class Program:
         except cl.RuntimeError as error:
             raise DeviceError(f"{file} does not build on {device.name}: {error}") from error
         self.seconds = time.perf_counter() - start
+        self.is_warm = False
 
     def warm_up(self, *kernels: str) -> None:
         """Launch ``kernels`` once on zeros, for PoCL generates code at the first launch.
@@ -118,6 +123,7 @@ class Program:
                 group = device.traits.group
                 cl.enqueue_nd_range_kernel(queue, kernel, (group,), (group,))
             queue.finish()
+        self.is_warm = True
         self.seconds += time.perf_counter() - start
 
     def bind(self, kernel: str, **arguments: Buffer | int | float | np.generic) -> Launch:
