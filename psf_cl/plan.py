@@ -55,6 +55,7 @@ from psf_cl.tables import (
     distinct_images,
     few_triangles,
     flatten,
+    light_spread,
     visible_shapes,
 )
 from psf_cl.traits import DeviceTraits
@@ -75,6 +76,10 @@ BUILD_BYTES = 240
 #: At equal times, against a table: with 12,050 (``many_lights``) a quarter of the error; with 1,201
 #: (a map of a game, 64 x 40) 1.7 times as much at 16 spp; other scenes here have at most 12.
 MANY_LIGHTS = 4096
+
+#: ``light_spread`` from which on they are many lights, not one that is made of many triangles: of
+#: such a lamp all triangles are near or far together, and a table is as good for less.
+SPREAD_LIGHTS = 0.5
 
 #: The least of a pool, and how often it is halved on the way there.
 MIN_SLOTS = 1 << 12
@@ -500,7 +505,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
     connected = _connect(settings, any(emits(m) for m in materials) or sky, bool(lights))
     rectangles = _rectangles(scene, settings, bool(connected.value))
     chosen = _light_sampling(
-        settings, bool(connected.value), _light_count(scene, bool(rectangles.value))
+        settings, bool(connected.value), _light_count(scene, bool(rectangles.value)), scene
     )
     feature_aovs = outputs & {"albedo", "normal", "depth"}
     return {
@@ -830,7 +835,7 @@ def _connect(settings: Settings, extended: bool, punctual: bool) -> Feature:
     return Feature(1, "lights are sampled at every vertex")
 
 
-def _light_sampling(settings: Settings, connected: bool, lights: int) -> Feature:
+def _light_sampling(settings: Settings, connected: bool, lights: int, scene: Scene) -> Feature:
     """Return how lights are drawn, and why."""
     if settings.light_sampling in ("power", "uniform"):
         return Feature(0, f"light_sampling is {settings.light_sampling}: a table of chances")
@@ -841,6 +846,9 @@ def _light_sampling(settings: Settings, connected: bool, lights: int) -> Feature
     if settings.light_sampling == "auto":
         if lights < MANY_LIGHTS:
             return Feature(0, f"light_sampling is auto: a table of {lights} lights is fast")
+        if (spread := light_spread(scene)) < SPREAD_LIGHTS:
+            why = f"{lights} lights are together in {spread:.2g} of the scene's length"
+            return Feature(0, f"light_sampling is auto: {why}")
         if settings.integrator == "metropolis":
             return Feature(1, f"light_sampling is auto, without photons: a tree of {lights} lights")
         return Feature(2, f"light_sampling is auto: photons of {lights} lights say which are seen")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 
@@ -29,6 +30,7 @@ from psf_cl.scene.model import (
     shines,
 )
 from psf_cl.scene.texture import decoded_srgb, mean_color
+from psf_cl.scene.transform import transform_points
 
 #: Chance that the light table keeps for emitters of finite size where there is also light from
 #: infinitely far: its flux through the scene says little about how much of it comes in.
@@ -521,6 +523,32 @@ def count_rectangles(scene: Scene) -> int:
         return 0
     surfaces = flatten(replace(scene, shapes=shapes)).surfaces
     return int(_rectangles(scene, surfaces, np.arange(len(surfaces))).sum())
+
+
+def light_spread(scene: Scene) -> float:
+    """Return the longest side of the box around all lights over that of the box around everything.
+
+    What moves counts where it is at rest.  0 where there is no light, or nothing has an extent.
+    """
+    boxes, lit = [], []
+    for shape in scene.shapes:
+        points = shape.mesh.positions[np.isfinite(shape.mesh.positions).all(axis=1)]
+        if len(points):
+            # The box of a turned box is somewhat large: it is quick, for meshes of any size.
+            corners = np.stack([points.min(axis=0), points.max(axis=0)]).astype(np.float64)
+            corners = np.array(list(itertools.product(*corners.T)))
+            boxes.append(transform_points(shape.transform, corners))
+            lit.append(emits(scene.materials[shape.material]))
+    for light in filter(shines, scene.lights):
+        if light.kind != "directional":
+            boxes.append(np.array([light.position], np.float64))
+            lit.append(True)
+    if not any(lit):
+        return 0.0
+    glowing = [box for box, is_light in zip(boxes, lit, strict=True) if is_light]
+    lights = np.ptp(np.concatenate(glowing), axis=0).max()
+    everything = np.ptp(np.concatenate(boxes), axis=0).max()
+    return float(lights / everything) if everything > 0.0 else 0.0
 
 
 def light_table(

@@ -252,6 +252,23 @@ def test_many_lights_have_photons_unless_something_else_is_asked_for():
     assert sampling(MANY_LIGHTS, light_sampling="power") == 0
 
 
+def test_one_lamp_of_many_triangles_is_no_reason_for_photons():
+    ball = primitives.sphere(80, 40)
+    assert len(ball.triangles) >= MANY_LIGHTS
+
+    def sampling(*places):
+        lamps = [
+            (ball, transform.translation(place) @ transform.scaling(0.05), glowing(5.0))
+            for place in places
+        ]
+        scene = build([floor(1.0, lambertian(0.5)), *lamps], camera((0, 1, 3), (0, 0, 0)))
+        return make_plan(scene, Settings()).features["LIGHT_SAMPLING"].value
+
+    assert sampling((0.0, 1.0, 0.0)) == 0
+    # Two of them, one at each end of the floor, are near and far.
+    assert sampling((-0.9, 1.0, 0.0), (0.9, 1.0, 0.0)) == 2
+
+
 def test_one_light_needs_no_photons():
     scene = build(
         [floor(1.0, lambertian(0.5))],
