@@ -179,10 +179,18 @@ def _light(light: Light) -> dict[str, Any]:
 
 
 def _image_sky(environment: Environment) -> dict[str, Any]:
-    """Return the sky; both renderers have -Z in the middle of its first column."""
+    """Return the sky; both renderers have -Z in the middle of its first column.
+
+    Mitsuba has the first and the last row at the poles, and not half a texel from them.
+    """
     placed = np.eye(4)
     placed[:3, :3] = environment.rotation
     radiance = environment.image * np.asarray(environment.radiance, np.float32)
+    rows = len(radiance)
+    place = np.clip(np.linspace(-0.5, rows - 0.5, rows), 0.0, rows - 1.0)
+    low = np.floor(place).astype(int)
+    part = (place - low).astype(np.float32)[:, None, None]
+    radiance = radiance[low] * (1.0 - part) + radiance[np.minimum(low + 1, rows - 1)] * part
     return {
         "type": "envmap",
         "bitmap": mi.Bitmap(np.ascontiguousarray(radiance, np.float32)),
