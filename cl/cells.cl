@@ -57,24 +57,25 @@ kernel void count_crowds(
 #endif
 
 #if WALLS
-/// Mark the cells where samples of complete passes met something within a cell's width: those that they are
-/// stored in, and those that they are in.  One work item W pixels, RUN times, before store_cells.
+/// Mark the cells where samples of complete passes met something within a cell's width with the side that it
+/// faces: those that they are stored in, and those that they are in.  One work item W pixels, RUN times,
+/// before store_cells.
 ///
 /// reads   beyond, vertices, counters
-/// writes  near_cells
+/// writes  near_cells (atomic)
 kernel void mark_near_cells(
     __global const Params *params,
     __global const Beyond *beyond,
     __global const CellVertex *vertices,
     const volatile __global uint *counters,
-    __global uint *near_cells CROWD_BUFFERS)
+    volatile __global uint *near_cells CROWD_BUFFERS)
 {
     const uint first = get_global_id(0) * (W * RUN);
     const uint end = min(first + W * RUN, params->pixel_count);
     const uint passes = first < end ? complete_passes(params, counters) : 0u;
     for (uint k = 0; k < passes; ++k) {
         const PassPlace place = place_of(params, counters[COUNTER_FILM_PASS] + k);
-        __global uint *marks = near_cells + place.slots;
+        volatile __global uint *marks = near_cells + place.slots;
         for (uint i = first; i < end; i += W) {
             const UInt wanted = lanes_before(MASK_ALL) + i;
             const Mask inside = wanted < params->pixel_count;
@@ -88,8 +89,8 @@ kernel void mark_near_cells(
                 params, &query, pixel, place.pass CROWD_ARGUMENTS_OF(crowds + place.slots));
             const CellPlace own = place_to_look_up(
                 params, &query, pixel, place.pass, 0 CROWD_ARGUMENTS_OF(crowds + place.slots));
-            mark_cells(params, marks, near, stored, place.pass);
-            mark_cells(params, marks, near, own, place.pass);
+            mark_cells(params, marks, near, stored, vertex);
+            mark_cells(params, marks, near, own, vertex);
         }
     }
 }
@@ -454,7 +455,7 @@ kernel void look_up_cells(
 /// Empty the tables of every complete pass and count what was in them.  One work item a bucket.
 ///
 /// reads   counters
-/// writes  cell_keys, cells, cell_squares, full_buckets; counters.{cells_used, cell_probes} (atomic)
+/// writes  cell_keys, cells, cell_squares, full_buckets, crowds, near_cells; counters.{cells_used, cell_probes} (atomic)
 kernel void clear_cells(
     __global const Params *params,
     volatile __global uint *counters,
@@ -465,6 +466,9 @@ kernel void clear_cells(
 #endif
 #if SPARSE
     __global uint *crowds,
+#endif
+#if WALLS
+    __global uint *near_cells,
 #endif
     __global uint *full_buckets)
 {
@@ -481,6 +485,10 @@ kernel void clear_cells(
 #if SPARSE
         for (uint i = 0; i < size; ++i)
             crowds[at + i] = 0u;
+#endif
+#if WALLS
+        for (uint i = 0; i < size; ++i)
+            near_cells[at + i] = 0u;
 #endif
         if (bucket_is_empty(cell_keys + at, size))
             continue;

@@ -355,7 +355,7 @@ kernel void shade_paths(
     const Float length = pick(camera_ray, (Float)(0.0f), FIELD(path, PATH_LENGTH)) + FIELD(path, PATH_HIT_T);
     FIELD(path, PATH_LENGTH) = length;
     put_v(path, PATH_BEYOND_R, pick_v(camera_ray, zero, get_v(path, PATH_BEYOND_R)));
-    put_u(path, PATH_VERTEX, known | near_bit(params, hit, vertex, depth, length, FIELD(path, PATH_HIT_T)));
+    put_u(path, PATH_VERTEX, known | near_bit(params, hit, vertex, depth, length, FIELD(path, PATH_HIT_T), s.ng));
 #if CELLS == 2
     Vec3 share = get_v(path, PATH_SHARE_R);
     const Vec3 rest = gather_light(path, shares_emission(params, vertex, depth), share, brought);

@@ -44,6 +44,8 @@
 #define FILTER_AUTO 0u // the first vertex that a wide lobe reached, over more than a cell
 #define FILTER_NONE 0xFFFFFFFFu // no vertex
 #define VERTEX_NEAR 0x80000000u // set if the path met a surface within a cell of its vertex
+#define VERTEX_FACE_SHIFT 27u // first bit of the side that a surface near the vertex faces
+#define VERTEX_FACE_MASK 7u // of that, shifted: axis and sign, 0 to 5
 #define VERTEX_REJECTED 0x40000000u // set if what was gathered is too large for a cell
 #define VERTEX_WALL_SHIFT 24u // first bit of what separates the vertex from where it is stored
 #define VERTEX_WALL_MASK 7u // of that, shifted: 0 nothing, or 1 + the side that a wall faces
@@ -312,7 +314,7 @@
 #define PATH_END_12 PATH_END_11
 #endif
 #if CELLS >= 1
-#define PATH_VERTEX (PATH_END_12 + 0u) // uint; 1 + depth of the vertex behind which light is shared, VERTEX_NEAR; 0: none
+#define PATH_VERTEX (PATH_END_12 + 0u) // uint; 1 + depth of the vertex behind which light is shared, its face; 0: none
 #define PATH_LENGTH (PATH_END_12 + 1u) // m, from the camera on
 #define PATH_BEYOND_R (PATH_END_12 + 2u) // of what was gathered, what is shared: it came from beyond that vertex
 #define PATH_BEYOND_G (PATH_END_12 + 3u)
@@ -806,7 +808,7 @@ typedef struct {
 /// What a sample gathered behind its cell's vertex.
 typedef struct {
     float radiance[3]; // at the camera
-    uint vertex; // 1 + its depth, VERTEX_NEAR, VERTEX_REJECTED, a wall; 0 if there is none
+    uint vertex; // 1 + its depth, VERTEX_NEAR, VERTEX_REJECTED, a face, a wall; 0 if there is none
 } Beyond;
 
 /// What averages per cell took from a pixel: sums over its samples, or a mean and its variance.

@@ -43,15 +43,17 @@ static inline Mask wants_cell(__global const Params *params, UInt depth, Float l
     return (depth > 0u) & (distance * distance > width * width * max(spread, 3.0f));
 }
 
-/// VERTEX_NEAR where the path has just met a surface within a cell of the vertex whose light it shares.
+/// VERTEX_NEAR where the path has just met a surface within a cell of the vertex whose light it shares, with
+/// the side that the surface faces.
 ///
 /// In corners and slits the light changes within a cell; samples of near and of far light have cells of
 /// their own, so that each place gets both in the parts in which it sees them.
 static inline UInt near_bit(
-    __global const Params *params, Mask hit, UInt vertex, UInt depth, Float length, Float distance)
+    __global const Params *params, Mask hit, UInt vertex, UInt depth, Float length, Float distance, Vec3 ng)
 {
     const Mask next = hit & (vertex != 0u) & (depth == vertex);
-    return pick_u(next & (distance < params->cell_width * (length - distance)), (UInt)(VERTEX_NEAR), (UInt)(0u));
+    return pick_u(next & (distance < params->cell_width * (length - distance)),
+                  VERTEX_NEAR | (cube_face(ng) << VERTEX_FACE_SHIFT), (UInt)(0u));
 }
 
 /// Hand in the vertices of the lanes in `chosen`.

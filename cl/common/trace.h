@@ -43,6 +43,25 @@ static inline Hits closest_hits(
 #endif
 }
 
+/// The same for what lies between `origin` and `origin` + `toward`, where t is 1.
+static inline Hits closest_hits_before(
+    __global const Params *params, Mask active, Vec3 origin, Vec3 toward, GEOMETRY_PARAMETERS)
+{
+#if FEW
+    Hits hits = trace_closest_few(params, active, origin, toward, GEOMETRY_ARGUMENTS);
+    hits.triangle = pick_u(hits.t < 1.0f, hits.triangle, (UInt)(NO_HIT));
+    return hits;
+#else
+    RaySetups rays;
+    set_up_rays(&rays, active, origin, toward, (Float)(1.0f));
+#if INSTANCES
+    return trace_closest_levels(nodes, blocks, instances, &rays, origin, toward ALPHA_ARGUMENTS);
+#else
+    return trace_closest(nodes, blocks, &rays ALPHA_ARGUMENTS);
+#endif
+#endif
+}
+
 /// Return for the lanes in `active` whether anything lies between `origin` and `origin` + `toward`.
 static inline Mask blocked_rays(
     __global const Params *params, Mask active, Vec3 origin, Vec3 toward, GEOMETRY_PARAMETERS)

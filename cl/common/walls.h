@@ -2,8 +2,9 @@
 //
 // A short ray goes from the vertex of a sample to the middle of its cell, just above the surface.  Where
 // something is in its way, the sample shares with those alone that see the same side of it: the two sides
-// of a wall never meet, wherever in the cell it stands.  Only cells that have a mark need rays: some path
-// went on from there to a surface within a cell's width.
+// of a wall never meet, wherever in the cell it stands.  Only cells where surfaces were seen that face
+// opposite ways need rays: paths that went on from there met them within a cell's width.  Of a wall that
+// ends the room they see one side alone, and nobody is behind it.
 #pragma once
 
 #include "lanes.h"
@@ -30,14 +31,19 @@
 #define WALL_ARGUMENTS_OF(marks) , marks SURFACE_ARGUMENT, GEOMETRY_BUFFER_ARGUMENTS
 #define WALL_ARGUMENTS WALL_ARGUMENTS_OF(near_cells)
 
-/// Mark the cells of the lanes in `near` with the number of the pass after that in which it was.
+/// Mark the cells of the lanes in `near` with the sides that what is near their samples faces.
 static inline void mark_cells(
-    __global const Params *params, __global uint *near_cells, Mask near, CellPlace place, uint pass)
+    __global const Params *params, volatile __global uint *near_cells, Mask near, CellPlace place, UInt vertex)
 {
     uint lane_at[W];
+    uint lane_side[W];
     store_lanes_u(entry_of(params, place), lane_at);
-    for (uint left = lane_bits(near); left; left &= left - 1u)
-        near_cells[lane_at[lowest_bit(left)]] = pass + 1u;
+    store_lanes_u((UInt)(1u) << ((vertex >> VERTEX_FACE_SHIFT) & VERTEX_FACE_MASK), lane_side);
+    for (uint left = lane_bits(near); left; left &= left - 1u) {
+        const uint k = lowest_bit(left);
+        if (!(LOOK(&near_cells[lane_at[k]]) & lane_side[k]))
+            atomic_or(&near_cells[lane_at[k]], lane_side[k]);
+    }
 }
 
 /// Return what separates points from the middles of their cells: 0 for nothing, or 1 + the side of the cube
@@ -54,22 +60,21 @@ LARGE_FUNCTION UInt wall_before(
     Vec3 toward = sub(cell_middle(place), from);
     // Both ends are as far above the plane of the surface.
     toward = add_scaled(toward, n, -dot3(toward, n));
-    const Mask blocked = mask & blocked_rays(params, mask, from, toward, GEOMETRY_ARGUMENTS);
-    if (!any_lane(blocked))
+    const Hits hits = closest_hits_before(params, mask, from, toward, GEOMETRY_ARGUMENTS);
+    const Mask hit = mask & (hits.triangle != NO_HIT);
+    if (!any_lane(hit))
         return (UInt)(0u);
-    const Vec3 direction = normalize3(toward);
-    const Hits hits = closest_hits(params, blocked, from, direction, GEOMETRY_ARGUMENTS);
-    const Mask hit = blocked & (hits.triangle != NO_HIT);
     const SurfacePoint s = surface_point(pick_u(hit, hits.triangle, (UInt)(0u)), hits.u, hits.v,
-                                         scale(direction, (Float)(-1.0f)), surfaces INSTANCE_ARGUMENTS);
+                                         scale(toward, (Float)(-1.0f)), surfaces INSTANCE_ARGUMENTS);
     return pick_u(hit, 1u + cube_face(s.ng), (UInt)(0u));
 }
 
-/// The same for the lanes of `mask` whose cells have a mark of the pass; 0 for the others.
+/// The same for the lanes of `mask` in whose cells opposite sides were seen; 0 for the others.
 static inline UInt wall_in_cell(
     __global const Params *params, Mask mask, const CellQuery *query, CellPlace place, uint pass, UInt pixel WALL_BUFFERS)
 {
-    const Mask near = mask & (GATHER_WORD(near_cells, entry_of(params, place)) == pass + 1u);
+    const UInt sides = GATHER_WORD(near_cells, entry_of(params, place));
+    const Mask near = mask & ((sides & (sides >> 1) & 0x15u) != 0u);
     if (!any_lane(near))
         return (UInt)(0u);
     return wall_before(params, near, query, place, mix_bits(pixel * 0x9e3779b9u + pass) WALL_ARGUMENTS);

@@ -540,7 +540,7 @@ BEYOND = Record(
     "What a sample gathered behind its cell's vertex.",
     _fields("""
     float radiance[3] - at the camera
-    uint vertex - 1 + its depth, VERTEX_NEAR, VERTEX_REJECTED, a wall; 0 if there is none
+    uint vertex - 1 + its depth, VERTEX_NEAR, VERTEX_REJECTED, a face, a wall; 0 if there is none
     """),
 )
 
@@ -810,7 +810,7 @@ OPTIONAL_PATH_FIELDS = (
         (
             (
                 "vertex",
-                "uint; 1 + depth of the vertex behind which light is shared, VERTEX_NEAR; 0: none",
+                "uint; 1 + depth of the vertex behind which light is shared, its face; 0: none",
             ),
             ("length", "m, from the camera on"),
             ("beyond_r", "of what was gathered, what is shared: it came from beyond that vertex"),
@@ -979,6 +979,8 @@ CONSTANTS = (
     ("FILTER_AUTO", 0, "the first vertex that a wide lobe reached, over more than a cell"),
     ("FILTER_NONE", 0xFFFFFFFF, "no vertex"),
     ("VERTEX_NEAR", 0x80000000, "set if the path met a surface within a cell of its vertex"),
+    ("VERTEX_FACE_SHIFT", 27, "first bit of the side that a surface near the vertex faces"),
+    ("VERTEX_FACE_MASK", 7, "of that, shifted: axis and sign, 0 to 5"),
     ("VERTEX_REJECTED", 0x40000000, "set if what was gathered is too large for a cell"),
     ("VERTEX_WALL_SHIFT", 24, "first bit of what separates the vertex from where it is stored"),
     ("VERTEX_WALL_MASK", 7, "of that, shifted: 0 nothing, or 1 + the side that a wall faces"),
