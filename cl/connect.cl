@@ -62,7 +62,13 @@ static inline uint connect_paths(
     keep_base(path, reflected, vec3_all((Float)(1.0f)), rest);
 #endif
 #if AOV_DIRECT
-    put_v(path, PATH_DIRECT_R, add(get_v(path, PATH_DIRECT_R), pick_v(depth == 0u, arrives, zero)));
+#if VIRTUAL_LIGHTS
+    // The second ray goes to what stands for reflected light.
+    const Mask is_direct = (Mask)(ray == 0u ? -1 : 0);
+#else
+    const Mask is_direct = MASK_ALL;
+#endif
+    put_v(path, PATH_DIRECT_R, add(get_v(path, PATH_DIRECT_R), pick_v((depth == 0u) & is_direct, arrives, zero)));
 #endif
 #if CACHE
     const UInt bits = mix_bits(get_u(path, PATH_SEED) + get_u(path, PATH_SAMPLE) * 0x85ebca6bu

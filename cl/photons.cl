@@ -68,11 +68,12 @@ kernel void emit_photons(
     put_u(path, PATH_PIXEL, e.light);
     put_u(path, PATH_TOWARD_X, e.point);
     put_u(path, PATH_STATUS, pick_u(starts, (UInt)(STATUS_ALIVE | 1u), (UInt)(STATUS_DONE)));
-    count_photons(photon_counters, PHOTONS_EMITTED, starts);
+    count_photons(photon_counters, PHOTONS_EMITTED, starts | broken);
     count_photons(photon_counters, PHOTONS_DARK, dark);
     count_photons(photon_counters, PHOTONS_REJECTED, broken);
 }
 
+#if LIGHT_PHOTONS
 /// Let every photon that hit something try for its place of the map: the least random number wins.
 ///
 /// reads   photons, surfaces
@@ -98,14 +99,16 @@ kernel void store_photons(
         return;
     const UInt triangle = get_u(path, PATH_HIT_TRIANGLE);
     const Mask hit = alive & (triangle != NO_HIT);
-    count_photons(photon_counters, PHOTONS_ESCAPED, alive & !hit);
     count_photons(photon_counters, PHOTONS_STORED, hit);
     const Vec3 wo = scale(get_v(path, PATH_DIRECTION_X), (Float)(-1.0f));
     const SurfacePoint s = surface_point(pick_u(hit, triangle, (UInt)(0u)), FIELD(path, PATH_HIT_U),
                                          FIELD(path, PATH_HIT_V), wo, surfaces INSTANCE_ARGUMENTS);
     const UInt node = GATHER_U(light_groups, pick_u(hit, get_u(path, PATH_PIXEL), (UInt)(0u)), node);
     const UInt key = mix_bits(get_u(path, PATH_SAMPLE) ^ params->seed);
+#if !VIRTUAL_LIGHTS
+    count_photons(photon_counters, PHOTONS_ESCAPED, alive & !hit);
     put_u(path, PATH_STATUS, pick_u(alive, (UInt)(STATUS_DONE), status));
+#endif
     put_u(path, PATH_SHADOW_Z, key);
     uint lane_key[W];
     store_lanes_u(key, lane_key);
@@ -165,3 +168,4 @@ kernel void tabulate_photons(
         return;
     tabulate_row(params, particle_words, particle_counts, particle_table, row);
 }
+#endif

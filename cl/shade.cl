@@ -10,6 +10,7 @@
 #include "common/bsdf.h"
 #include "common/material.h"
 #include "common/light.h"
+#include "common/virtual_light.h"
 #include "common/sharing.h"
 #include "common/splits.h"
 #include "common/chain.h"
@@ -216,6 +217,11 @@ kernel void shade_paths(
     __global const uint *particle_words,
     __global const uint *particle_counts,
 #endif
+#if VIRTUAL_LIGHTS
+    __global const VirtualLight *virtual_lights,
+    __global const uint *virtual_counts,
+    __global const uint *photon_counters,
+#endif
 #if SEEN
     __global Seen *seen,
 #endif
@@ -410,6 +416,10 @@ kernel void shade_paths(
 #endif
 
     Mask goes_on = hit & (depth < params->max_depth);
+#if VIRTUAL_LIGHTS
+    // Beyond the first surface of no mirror there are only lights to be found.
+    goes_on &= camera_ray | (pdf_bsdf >= PDF_DELTA);
+#endif
     const Mask delta = is_delta(b);
 #if SEEN
 #if INSTANCES
@@ -670,6 +680,28 @@ kernel void shade_paths(
             put_v(path, RAY_FIELD(ray, SHADOW_X), origin);
             put_v(path, RAY_FIELD(ray, TOWARD_X), add(light.toward, sub(above, origin)));
         }
+#if VIRTUAL_LIGHTS
+        {
+            UInt slot_bits;
+            UInt unused;
+            sample_bits(seed, index, PAIR_RAYS + depth * VERTEX_PAIRS, params->sampler, &slot_bits, &unused);
+            const VirtualSample light =
+                sample_virtual_light(params, virtual_lights, virtual_counts, photon_counters, asks,
+                                     virtual_slot(slot_bits), above);
+            const Vec3 wi_local =
+                vec3(dot3(tangent, light.wi), dot3(bitangent, light.wi), dot3(s.ns, light.wi));
+            Float pdf;
+            const Vec3 f = eval_bsdf(b, chances, wo_local, wi_local, dot3(s.ng, light.wi), &pdf);
+            put_v(path, RAY_FIELD(1u, LIGHT_R), pick_v(asks, mul(mul(beta, f), light.radiance), zero));
+#if BASE == 2
+            put_v(path, RAY_FIELD(1u, BASE_LIGHT_R),
+                  pick_v(camera_ray, base_share(b, chances, base, wi_local, f), base_part));
+#endif
+            const Vec3 origin = ray_origin(s, light.wi);
+            put_v(path, RAY_FIELD(1u, SHADOW_X), origin);
+            put_v(path, RAY_FIELD(1u, TOWARD_X), add(light.toward, sub(above, origin)));
+        }
+#endif
     }
 #endif
 

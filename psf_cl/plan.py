@@ -48,6 +48,7 @@ from psf_cl.stages import (
     shade,
     splats,
     temporal,
+    virtual_lights,
 )
 from psf_cl.stages.spec import BufferSpec, Context, Feature, StageSpec
 from psf_cl.tables import (
@@ -327,6 +328,7 @@ def make_plan(
     for module in (
         animate,
         photons,
+        virtual_lights,
         camera,
         metropolis,
         intersect,
@@ -566,6 +568,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
         ),
         "CONNECT": connected,
         "LIGHT_SAMPLING": chosen,
+        "VIRTUAL_LIGHTS": _virtual_lights(settings, connected),
         "SHADOW_RAYS": _shadow_rays(settings, connected, chosen),
         "LENS": _lens(scene),
         "MOTION": _motion(scene),
@@ -797,6 +800,8 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     full["LIGHT_SAMPLING"] = features["LIGHT_SAMPLING"]
     full["RECTANGLES"] = features["RECTANGLES"]
     full["SHADOW_RAYS"] = features["SHADOW_RAYS"]
+    # Photons would stand for what paths bring.
+    full["VIRTUAL_LIGHTS"] = features["VIRTUAL_LIGHTS"]
     # Chains are another integrator, which has no images beside the one.
     full["METROPOLIS"] = features["METROPOLIS"]
     # Directions would be drawn otherwise: the image would have other noise.
@@ -857,10 +862,23 @@ def _light_sampling(settings: Settings, connected: bool, lights: int, scene: Sce
     return Feature(2, f"light_sampling is photon: photons of {lights} lights say which are seen")
 
 
+def _virtual_lights(settings: Settings, connected: Feature) -> Feature:
+    """Return whether photons stand for light that is reflected more than once."""
+    if settings.indirect_light == "paths":
+        return Feature(0, "indirect_light is paths")
+    if not connected.value:
+        return Feature(0, connected.reason)
+    if settings.max_depth < 2:
+        return Feature(0, f"max_depth is {settings.max_depth}: light is reflected once at most")
+    return Feature(1, "indirect_light is virtual_lights: photons stand for reflected light")
+
+
 def _shadow_rays(settings: Settings, connected: Feature, chosen: Feature) -> Feature:
     """Return how many rays to lights a vertex has at most, 0 for one."""
     if not connected.value:
         return Feature(0, connected.reason)
+    if _virtual_lights(settings, connected).value:
+        return Feature(2, "indirect_light is virtual_lights: one more ray goes to one of these")
     if settings.shadow_rays == "1":
         return Feature(0, "shadow_rays is 1")
     if settings.shadow_rays != "auto":

@@ -54,6 +54,7 @@ from psf_cl.stages import (
     restore,
     screen,
     temporal,
+    virtual_lights,
 )
 
 #: Looks of the host at the counters for each count of the paths by depth, which takes 0.4 ms on two
@@ -1203,7 +1204,14 @@ class Renderer:
         if "photons" in programs:
             intersect = next(s for s in self.plan.stages if s.name == "intersect").kernels[0]
             paths = intersect.paths_per_item(traits)
-            self.photon_map = photons.PhotonMap(self.device, programs, self.buffers, traits, paths)
+            virtual = None
+            if "virtual_lights" in programs:
+                virtual = virtual_lights.VirtualLights(
+                    self.device, programs["virtual_lights"], self.buffers, self.settings
+                )
+            self.photon_map = photons.PhotonMap(
+                self.device, programs, self.buffers, traits, paths, virtual
+            )
         self.film_program = programs["film"]
         self.film_launches = [
             (self._add_launch(ring, name, planes, partial=False), planes)

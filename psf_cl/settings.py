@@ -101,6 +101,15 @@ class Settings:
         doc="rays to lights from each vertex; auto: of the first as many as photons know groups of "
         "lights, up to 4, of others one",
     )
+    indirect_light: str = _choice(
+        "paths",
+        "virtual_lights",
+        doc="light reflected more than once by paths, or by photons that stand for it, to compare: "
+        "biased, for they are dimmed where they are near",
+    )
+    virtual_clearance: float = _number(
+        0.05, 0.0, 1.0, doc="how near that is, radii of the scene; 0 for no bias, and bright dots"
+    )
     direct_sampling: str = _choice(
         "mis", "light", "bsdf", doc="direct light by both strategies, or by one of them alone"
     )
@@ -294,11 +303,21 @@ PRESETS: dict[str, dict[str, Any]] = {
 #: What goes with ``integrator=metropolis``: it has no pixel's samples to share, guide or keep.
 METROPOLIS_NEEDS = {
     "guiding": "off",
+    "indirect_light": "paths",
     "path_filter": "off",
     "screen_filter": "off",
     "shadow_rays": "1",
     "splits": 1,
     "temporal": "off",
+}
+
+
+#: What goes with ``indirect_light=virtual_lights``: there are no paths to share or to learn from.
+VIRTUAL_LIGHTS_NEED = {
+    "guiding": "off",
+    "path_filter": "off",
+    "shadow_rays": "1",
+    "termination": "roulette",
 }
 
 
@@ -313,6 +332,13 @@ def check_together(settings: Settings) -> None:
             "settings: termination=cache with a path_filter needs cache_trace=0, for averages take "
             f"no negative light; got {settings.cache_trace}"
         )
+    if settings.indirect_light == "virtual_lights":
+        for key, value in VIRTUAL_LIGHTS_NEED.items():
+            if getattr(settings, key) != value:
+                raise InputError(
+                    f"settings: indirect_light=virtual_lights needs {key}={value}; "
+                    f"got {getattr(settings, key)}"
+                )
     if settings.integrator != "metropolis":
         return
     for key, value in METROPOLIS_NEEDS.items():

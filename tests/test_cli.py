@@ -502,7 +502,7 @@ def test_plan_follows_the_options(all_features, capsys):
         "VERTEX_COLORS",
         "WALLS",
     }
-    unused |= {"AOV_LIGHTS", "SHADOW_RAYS"}
+    unused |= {"AOV_LIGHTS", "SHADOW_RAYS", "VIRTUAL_LIGHTS"}
     off_by_default = unused | {"AOV_DIRECT", "AOV_FEATURES"}
     assert off == off_by_default and plan["crop"] == [0, 0, 24, 16]
     plan, off = features("--camera above --aov direct --crop 1,2,3,4")

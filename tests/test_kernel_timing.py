@@ -263,9 +263,17 @@ def full_plan():
     return make_plan(scene, settings, AOVS, statistics=True, full=True, halves=True)
 
 
+def virtual_stages():
+    """Return the stages that go with virtual lights alone."""
+    scene = replace(small_scene(), lights=(Light("point", (1.0, 1.0, 1.0)),))
+    settings = Settings(indirect_light="virtual_lights")
+    stages = make_plan(scene, settings, AOVS, full=True).stages
+    return tuple(stage for stage in stages if stage.name == "virtual_lights")
+
+
 def test_kernels_declare_the_fields_of_a_path_that_their_sources_use():
     checked = 0
-    for stage in full_plan().stages:
+    for stage in (*full_plan().stages, *virtual_stages()):
         reads, writes = accesses(stage)
         if stage.name == "film":
             # It finds the word itself, in a pool of any lanes.
@@ -321,7 +329,7 @@ def test_the_full_build_has_every_feature_and_the_same_image(device):
         on = {name for name, feature in opened.plan.features.items() if feature.value}
         # In place of something, for what is not there, or with other random numbers.
         never = {"FEW", "METROPOLIS", "INSTANCES", "MOTION", "CACHE", "GUIDE", "LIGHT_SAMPLING"}
-        never |= {"RECTANGLES", "SHADOW_RAYS", "AOV_GUIDE"}
+        never |= {"RECTANGLES", "SHADOW_RAYS", "VIRTUAL_LIGHTS", "AOV_GUIDE"}
         assert (on == opened.plan.features.keys() - never) == full
         planned = {buffer.name: buffer.bytes for buffer in opened.plan.buffers}
         allocated = {name: buffer.bytes for name, buffer in opened.buffers.items()}

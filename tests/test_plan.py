@@ -270,7 +270,7 @@ def test_every_flag_at_once_renders(wants):
     # Chains of paths would leave out what samples of pixels are for, places the list of triangles.
     off = {name for name, feature in opened.plan.features.items() if not feature.value}
     # What averages take from a pixel is kept apart only for what the screen filter is in place of.
-    assert off == {"METROPOLIS", "INSTANCES", "MOTION", "RESTORE"}
+    assert off == {"METROPOLIS", "INSTANCES", "MOTION", "RESTORE", "VIRTUAL_LIGHTS"}
     left_out = dict(opened.plan.left_out)
     assert left_out.keys() == {name.lower() for name in off}
     assert left_out["metropolis"] == "integrator is path"
@@ -336,8 +336,10 @@ def flags_read(text, names):
 
 def test_stages_declare_the_flags_that_their_sources_read():
     scene, outputs = with_flags(*(flag for flag in CHOICES if flag != "ENVIRONMENT"))
+    virtual = Settings(indirect_light="virtual_lights", light_sampling="photon")
     plan = make_plan(scene, Settings(), outputs)
-    for stage in plan.stages:
+    more = make_plan(scene, virtual, outputs).stages
+    for stage in (*plan.stages, *(s for s in more if s.name in ("photons", "virtual_lights"))):
         own = (kernel_folder() / stage.source).read_text(encoding="utf-8")
         # An undeclared flag would be 0 whatever the scene needs.
         assert flags_read(own, plan.features) <= set(stage.flags), stage.name

@@ -50,6 +50,9 @@
 #error "LIGHT_SAMPLING must be 0 (a table of chances), 1 (a tree of lights) or 2 (photons)"
 #endif
 #define LIGHT_PHOTONS (LIGHT_SAMPLING == 2)
+#ifndef VIRTUAL_LIGHTS
+#error "VIRTUAL_LIGHTS must be 0 or 1 (photons stand for reflected light)"
+#endif
 #ifndef SHADOW_RAYS
 #error "SHADOW_RAYS must be 0 (one at a vertex) or how many at most"
 #endif

@@ -65,6 +65,8 @@
 #define GUIDE_SIDE 8u // parts of the hemisphere a side of the square
 #define GUIDE_BINS 64u
 #define RAY_WORDS 19u // of a path, for each shadow ray after the first
+#define VIRTUAL_LIGHTS_MOST 8192u // slots of the table of virtual lights
+#define VIRTUAL_SHIFT 19u // of random numbers, down to its slots
 #define PARTICLE_PLACES 64u // of a cell of the map of photons
 #define PARTICLE_KINDS 14u // groups of lights that a cell of it knows at most
 #define PARTICLE_SIZES 3u // of cells of that map, each four times as wide as the one before
@@ -412,11 +414,13 @@
 #define COUNTER_PENDING_SHADOW 35u
 #define COUNTER_FINISHED 36u // first of the ring: samples done of each pass in flight
 
-#define PHOTONS_EMITTED 0u // with any power
+#define PHOTONS_EMITTED 0u // with any power, also one that is not finite
 #define PHOTONS_DARK 1u // drawn where their light gives none
 #define PHOTONS_ESCAPED 2u // left the scene
 #define PHOTONS_STORED 3u // deposits in the map
-#define PHOTONS_REJECTED 4u // with a power that is not finite
+#define PHOTONS_ABSORBED 4u // ended at a surface that reflected no more; of those that go on
+#define PHOTONS_CUT 5u // ended by the limit of bounces; of those that go on
+#define PHOTONS_REJECTED 6u // ended with a power that is not finite
 
 /// Everything that is the same for all paths of a render.
 typedef struct {
@@ -447,6 +451,7 @@ typedef struct {
     uint node_bits; // that a node of the tree of lights takes
     uint particle_cells; // of the map of photons, a power of two
     float particle_cell; // edge of a cell, m per m from the camera
+    float virtual_clearance; // radii of the scene; nearer virtual lights are no brighter
     uint shadow_rays; // of each vertex; 0: as many as its photons ask for
     float photon_floor; // chance that a light is drawn whatever photons say
     uint environment_width; // texels
@@ -498,7 +503,7 @@ typedef struct {
     float cache_steps; // fixed-point steps of a sum of radiance per unit, a power of two
     float cache_limit; // radiance from which a sample is too large for these sums
     float cache_trace; // least chance that a path goes on where a cell is known
-    uint pad[2]; // fills the record
+    uint pad[1]; // fills the record
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.
@@ -704,6 +709,14 @@ typedef struct {
     float chance; // that the table of lights draws one of its lights
     uint pad[2]; // fills the record
 } LightGroup;
+
+/// Where a photon came to, as a light.
+typedef struct {
+    float p[3]; // world, m; off the surface
+    uint ng; // geometric normal, octahedral, 16 bits a coordinate
+    float power[3]; // radiant flux that its diffuse base reflects, times the photons drawn
+    float pad; // fills the record
+} VirtualLight;
 
 /// What both nodes of a LightPair have in common, to fit their parent.
 typedef struct {

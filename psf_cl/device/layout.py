@@ -96,6 +96,7 @@ PARAMS = Record(
     uint node_bits - that a node of the tree of lights takes
     uint particle_cells - of the map of photons, a power of two
     float particle_cell - edge of a cell, m per m from the camera
+    float virtual_clearance - radii of the scene; nearer virtual lights are no brighter
     uint shadow_rays - of each vertex; 0: as many as its photons ask for
     float photon_floor - chance that a light is drawn whatever photons say
     uint environment_width - texels
@@ -408,6 +409,17 @@ LIGHT_GROUP = Record(
     """),
 )
 
+VIRTUAL_LIGHT = Record(
+    "VirtualLight",
+    "Where a photon came to, as a light.",
+    _fields("""
+    float p[3] - world, m; off the surface
+    uint ng - geometric normal, octahedral, 16 bits a coordinate
+    float power[3] - radiant flux that its diffuse base reflects, times the photons drawn
+    float pad - fills the record
+    """),
+)
+
 LIGHT_BOUNDS = Record(
     "LightBounds",
     "What both nodes of a LightPair have in common, to fit their parent.",
@@ -675,6 +687,7 @@ RECORDS = (
     LIGHT,
     LIGHT_PAIR,
     LIGHT_GROUP,
+    VIRTUAL_LIGHT,
     LIGHT_BOUNDS,
     ENVIRONMENT_CELL,
     FILM_SUM,
@@ -876,11 +889,13 @@ CHAIN_FIELDS = (
 
 #: Words of the counters of photons, all uint: what became of those that were emitted.
 PHOTON_COUNTERS = (
-    ("emitted", "with any power"),
+    ("emitted", "with any power, also one that is not finite"),
     ("dark", "drawn where their light gives none"),
     ("escaped", "left the scene"),
     ("stored", "deposits in the map"),
-    ("rejected", "with a power that is not finite"),
+    ("absorbed", "ended at a surface that reflected no more; of those that go on"),
+    ("cut", "ended by the limit of bounces; of those that go on"),
+    ("rejected", "ended with a power that is not finite"),
 )
 
 #: Words of the counters, all uint.
@@ -1000,6 +1015,8 @@ CONSTANTS = (
     ("GUIDE_SIDE", GUIDE_SIDE, "parts of the hemisphere a side of the square"),
     ("GUIDE_BINS", GUIDE_SIDE**2, ""),
     ("RAY_WORDS", len(RAY_FIELDS), "of a path, for each shadow ray after the first"),
+    ("VIRTUAL_LIGHTS_MOST", 1 << 13, "slots of the table of virtual lights"),
+    ("VIRTUAL_SHIFT", 32 - 13, "of random numbers, down to its slots"),
     ("PARTICLE_PLACES", 64, "of a cell of the map of photons"),
     ("PARTICLE_KINDS", 14, "groups of lights that a cell of it knows at most"),
     ("PARTICLE_SIZES", 3, "of cells of that map, each four times as wide as the one before"),

@@ -50,7 +50,15 @@ def plan(context: Context) -> StageSpec | None:
         "connect",
         "sampled lights need to be seen",
         "connect.cl",
-        flags=("FEW", "INSTANCES", "ALPHA", "VERTEX_COLORS", "AOV_DIRECT", *POOL_FLAGS),
+        flags=(
+            "FEW",
+            "INSTANCES",
+            "ALPHA",
+            "VERTEX_COLORS",
+            "AOV_DIRECT",
+            "VIRTUAL_LIGHTS",
+            *POOL_FLAGS,
+        ),
         kernels=(kernel,),
         traces=True,
     )

@@ -14,6 +14,7 @@ from psf_cl.stages.spec import POOL_FLAGS, BufferSpec, Context, KernelSpec, Stag
 if TYPE_CHECKING:
     from psf_cl.device.device import Buffer, Device
     from psf_cl.device.program import Launch, Program
+    from psf_cl.stages.virtual_lights import VirtualLights
     from psf_cl.traits import DeviceTraits
 
 #: Photons of an epoch if it is not said how many: as many as a share of its camera paths.
@@ -45,6 +46,7 @@ def photons_for(settings: Settings, passes: int, pixel_count: int) -> int:
 def parameters(settings: Settings, light_count: int) -> dict[str, object]:
     """Return what the kernels need to know, by the names of ``layout.PARAMS``."""
     return {
+        "virtual_clearance": settings.virtual_clearance,
         "node_bits": max(2 * light_count - 1, 0).bit_length(),
         "shadow_rays": 0 if settings.shadow_rays == "auto" else int(settings.shadow_rays),
         "particle_cells": CELLS,
@@ -55,30 +57,44 @@ def parameters(settings: Settings, light_count: int) -> dict[str, object]:
 
 def plan(context: Context) -> StageSpec | None:
     """Return the stage, or None if no photon is needed."""
-    if context.features["LIGHT_SAMPLING"].value < 2:
+    mapped = context.features["LIGHT_SAMPLING"].value == 2
+    if not (mapped or context.on("VIRTUAL_LIGHTS")):
         return None
     uint32 = np.dtype(np.uint32)
     places = CELLS * PLACES
     words = context.traits.slots * context.path_field_count
-    kernels = (
+    ends = () if context.on("VIRTUAL_LIGHTS") else ("status",)
+    emitting = (
         KernelSpec(
             "emit_photons",
             writes=("status", "origin", "direction", "beta", "seed", "sample", "pixel", "toward_x"),
             record_bytes=layout.LIGHT.dtype.itemsize,
         ),
+    )
+    keeping = (
         KernelSpec(
             "store_photons",
             reads=("status", "direction", "hit_triangle", "hit_u", "hit_v", "sample", "pixel"),
-            writes=("shadow_z", "status"),
+            writes=("shadow_z", *ends),
             record_bytes=layout.SURFACE.dtype.itemsize + 8,
             hash_accesses=1,
         ),
         KernelSpec("settle_photons", reads=("shadow_z",), record_bytes=8, hash_accesses=1),
         KernelSpec("tabulate_photons", record_bytes=8 * PLACES + 4 * RECORD_WORDS),
     )
+    flight = (
+        BufferSpec("photons", np.dtype(np.float32), words, "photons in flight", True),
+        BufferSpec("photon_counters", uint32, len(layout.COUNTERS) + context.ring, "of photons"),
+    )
+    table = (
+        BufferSpec("particle_keys", uint32, places, "least random number of each place"),
+        BufferSpec("particle_counts", uint32, places, "photons that came to it"),
+        BufferSpec("particle_words", uint32, places, "light and cell of the one that stayed"),
+        BufferSpec("particle_table", uint32, CELLS * RECORD_WORDS, "what each cell knows"),
+    )
     return StageSpec(
         "photons",
-        "photons say which lights a place sees",
+        "photons say which lights a place sees" if mapped else "photons bring light to surfaces",
         "photons.cl",
         flags=(
             "TEXTURES",
@@ -89,19 +105,11 @@ def plan(context: Context) -> StageSpec | None:
             "ENVIRONMENT",
             "ALPHA",
             "INSTANCES",
+            "VIRTUAL_LIGHTS",
             *POOL_FLAGS,
         ),
-        kernels=kernels,
-        buffers=(
-            BufferSpec("photons", np.dtype(np.float32), words, "photons in flight", True),
-            BufferSpec(
-                "photon_counters", uint32, len(layout.COUNTERS) + context.ring, "of photons"
-            ),
-            BufferSpec("particle_keys", uint32, places, "least random number of each place"),
-            BufferSpec("particle_counts", uint32, places, "photons that came to it"),
-            BufferSpec("particle_words", uint32, places, "light and cell of the one that stayed"),
-            BufferSpec("particle_table", uint32, CELLS * RECORD_WORDS, "what each cell knows"),
-        ),
+        kernels=(*emitting, *(keeping if mapped else ())),
+        buffers=(*flight, *(table if mapped else ())),
         per_pass=True,
         between_passes=True,
     )
@@ -117,6 +125,7 @@ class PhotonMap:
         buffers: Mapping[str, Buffer],
         traits: DeviceTraits,
         runs_per_trace: int,
+        virtual_lights: VirtualLights | None = None,
     ) -> None:
         """Bind the kernels; ``runs_per_trace`` are the paths of an item of intersect_closest."""
         self.device, self.buffers, self.traits = device, buffers, traits
@@ -126,17 +135,26 @@ class PhotonMap:
             "counters": buffers["photon_counters"],
         }
         self.emit = own.bind_planned("emit_photons", buffers, first=0, count=0)
-        self.store = own.bind_planned("store_photons", buffers)
-        self.settle = own.bind_planned("settle_photons", buffers)
-        self.tabulate = own.bind_planned("tabulate_photons", buffers)
+        self.keep: tuple[Launch, ...] = ()
+        self.tabulate: Launch | None = None
+        if "particle_table" in buffers:
+            self.keep = (
+                own.bind_planned("store_photons", buffers),
+                own.bind_planned("settle_photons", buffers),
+            )
+            self.tabulate = own.bind_planned("tabulate_photons", buffers)
+        self.virtual_lights = virtual_lights
         self.trace = programs["intersect"].bind_planned("intersect_closest", traced)
         self.trace_items = -(-traits.slots // runs_per_trace)
 
     def clear(self) -> None:
         """Forget all photons."""
-        self.device.fill(self.buffers["particle_keys"], 0xFF)
-        for name in ("counts", "words", "table"):
-            self.device.fill(self.buffers[f"particle_{name}"])
+        if self.tabulate is not None:
+            self.device.fill(self.buffers["particle_keys"], 0xFF)
+            for name in ("counts", "words", "table"):
+                self.device.fill(self.buffers[f"particle_{name}"])
+        if self.virtual_lights is not None:
+            self.virtual_lights.clear()
         self.device.fill(self.buffers["photon_counters"])
 
     def add(self, count: int) -> None:
@@ -147,10 +165,15 @@ class PhotonMap:
             # Numbers of 32 bits: they begin again.
             self.emit.set(first=(first + start) % (1 << 32), count=batch)(items)
             self.trace(self.trace_items)
-            launches: tuple[Launch, ...] = (self.store, self.settle)
-            for launch in launches:
+            for launch in self.keep:
                 launch(items)
-        self.tabulate(CELLS)
+            if self.virtual_lights is not None:
+                self.virtual_lights.scatter_all(items)
+                for _ in range(self.virtual_lights.surfaces - 1):
+                    self.trace(self.trace_items)
+                    self.virtual_lights.scatter_all(items)
+        if self.tabulate is not None:
+            self.tabulate(CELLS)
 
     def counts(self) -> dict[str, int]:
         """Return what became of the photons so far, by the names of ``layout.PHOTON_COUNTERS``."""
@@ -161,4 +184,4 @@ class PhotonMap:
     def drawn(self) -> int:
         """Return how many photons were drawn since the map was cleared."""
         counts = self.counts()
-        return counts["emitted"] + counts["dark"] + counts["rejected"]
+        return counts["emitted"] + counts["dark"]

@@ -53,6 +53,7 @@ def plan(context: Context) -> StageSpec:
             "AOV_LIGHTS",
             "MOTION",
             "SEEN",
+            "VIRTUAL_LIGHTS",
             *POOL_FLAGS,
             "METROPOLIS",
         ),
