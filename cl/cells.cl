@@ -12,6 +12,7 @@
 #include "common/cells.h"
 #include "common/cell_samples.h"
 #include "common/hash_map.h"
+#include "common/cell_history.h"
 #include "common/shared_samples.h"
 #include "common/walls.h"
 
@@ -114,7 +115,7 @@ static inline void store_samples(
 #endif
     __global uint *full_buckets,
     uint first,
-    const PassPlace *place CROWD_BUFFERS WALL_BUFFERS)
+    const PassPlace *place CHANGE_BUFFER CROWD_BUFFERS WALL_BUFFERS)
 {
     const UInt wanted = lanes_before(MASK_ALL) + first;
     const Mask inside = wanted < params->pixel_count;
@@ -165,6 +166,13 @@ static inline void store_samples(
     store_lanes_u(square_low, lane_square_low);
     store_lanes_u(square_high, lane_square_high);
 #endif
+#if CELL_HISTORY == 2
+    UInt a;
+    UInt b;
+    cell_random(params, pixel / CELL_TILE, place->pass, CELL_STORE, &a, &b);
+    float lane_change[W];
+    store_lanes(change_in_cell(params, &query, at, a, b, params->cell_flags & CELL_JITTER CHANGE_ARGUMENT), lane_change);
+#endif
     const uint size = bucket_size(params->cell_slots);
     uint lane_bucket[W];
     uint lane_slot[W];
@@ -180,6 +188,13 @@ static inline void store_samples(
             failed += popcount(lane_same[i]);
         } else {
             add_lanes(&cells[slot], lane_same[i], lane_low, lane_high);
+#if CELL_HISTORY == 2
+            float change = 0.0f;
+            for (uint same = lane_same[i]; same; same &= same - 1u)
+                change = max(change, lane_change[lowest_bit(same)]);
+            if (change > 0.0f)
+                atomic_max(&cells[slot].change, as_uint(change));
+#endif
 #if AOV_CELLS
             const ulong square = sum_lanes(lane_same[i], lane_square_low, lane_square_high);
             add_fixed(&squares[slot].low, &squares[slot].high, (uint)square, (uint)(square >> 32));
@@ -208,7 +223,7 @@ kernel void store_cells(
 #if AOV_CELLS
     volatile __global CellSquares *cell_squares,
 #endif
-    __global uint *full_buckets CROWD_BUFFERS WALL_BUFFERS)
+    __global uint *full_buckets CHANGE_BUFFER CROWD_BUFFERS WALL_BUFFERS)
 {
     const uint first = get_global_id(0) * (W * RUN);
     const uint end = min(first + W * RUN, params->pixel_count);
@@ -221,7 +236,8 @@ kernel void store_cells(
 #if AOV_CELLS
                           cell_squares + place.slots,
 #endif
-                          full_buckets + place.buckets, i, &place CROWD_ARGUMENTS_OF(crowds + place.slots)
+                          full_buckets + place.buckets, i,
+                          &place CHANGE_ARGUMENT CROWD_ARGUMENTS_OF(crowds + place.slots)
                                   WALL_ARGUMENTS_OF(near_cells + place.slots));
     }
 }
@@ -320,9 +336,12 @@ static inline void look_up_samples(
 #if RESTORE
     __global Lost *film_lost,
 #endif
+#if CELL_HISTORY
+    __global SharedLight *shared,
+#endif
     __global float *samples,
     uint first,
-    const PassPlace *place CROWD_BUFFERS WALL_BUFFERS)
+    const PassPlace *place KNOWN_BUFFERS CROWD_BUFFERS WALL_BUFFERS)
 {
     const UInt inside = lanes_before(MASK_ALL) + first;
     const UInt pixel = pick_u(inside < params->pixel_count, inside, (UInt)(0u));
@@ -371,6 +390,18 @@ static inline void look_up_samples(
     uint lane_slot[W];
     store_lanes_u(slot, lane_slot);
 #endif
+#if CELL_HISTORY
+    const CellKnown known =
+        known_of(params, found, &query, at, wall, pixel, place->pass KNOWN_ARGUMENTS);
+    const Mask is_known = known.frames > 0.0f;
+    const Vec3 before = pick_v(is_known, mul(load_gate(vertices, pixel), known.mean), light);
+    float lane_before[4][W];
+    store_lanes(before.x, lane_before[0]);
+    store_lanes(before.y, lane_before[1]);
+    store_lanes(before.z, lane_before[2]);
+    store_lanes(known.frames, lane_before[3]);
+    const uint cell_lanes = lane_bits(found);
+#endif
     float lane_light[3][W];
     store_lanes(light.x, lane_light[0]);
     store_lanes(light.y, lane_light[1]);
@@ -380,6 +411,19 @@ static inline void look_up_samples(
         const float4 more = (float4)(lane_light[0][i], lane_light[1][i], lane_light[2][i], 0.0f);
         const float4 before = vload4(first + i, samples);
         vstore4(before + more, first + i, samples);
+#if CELL_HISTORY
+        if (before.w > 0.0f && (cell_lanes >> i & 1u)) {
+            __global float *sums = (__global float *)&shared[first + i];
+            const float4 older = (float4)(lane_before[0][i], lane_before[1][i], lane_before[2][i], 1.0f);
+            float4 base_part = (float4)(older.xyz, 0.0f);
+#if BASE
+            base_part *= base_share_of(beyond, seen, first + i);
+#endif
+            vstore4(vload4(0, sums) + (float4)(more.xyz, lane_before[3][i]), 0, sums);
+            vstore4(vload4(1, sums) + older, 1, sums);
+            vstore4(vload4(2, sums) + base_part, 2, sums);
+        }
+#endif
 #if RESTORE
         // Of a sample that the film does not take nothing is known.
         if (before.w > 0.0f) {
@@ -406,8 +450,9 @@ static inline void look_up_samples(
 /// Add the light from behind the vertices to the samples of every complete pass: the average of the cell,
 /// or the sample's own where there is none.  One work item W pixels, RUN times, after resolve_cells.
 ///
-/// reads   beyond, vertices, cell_keys, cells, full_buckets, seen; with WALLS near_cells, geometry
-/// writes  samples, base, film_lost, film_cells; counters.unfiltered_samples (atomic)
+/// reads   beyond, vertices, cell_keys, cells, full_buckets, seen; kept_*, cell_changes; with WALLS near_cells,
+///         geometry
+/// writes  samples, base, film_lost, film_cells, shared_light; counters.unfiltered_samples (atomic)
 kernel void look_up_cells(
     __global const Params *params,
     __global const Beyond *beyond,
@@ -427,7 +472,10 @@ kernel void look_up_cells(
 #if RESTORE
     __global Lost *film_lost,
 #endif
-    __global float *samples CROWD_BUFFERS WALL_BUFFERS)
+#if CELL_HISTORY
+    __global SharedLight *shared_light,
+#endif
+    __global float *samples KNOWN_BUFFERS CROWD_BUFFERS WALL_BUFFERS)
 {
     const uint first = get_global_id(0) * (W * RUN);
     const uint end = min(first + W * RUN, params->pixel_count);
@@ -447,7 +495,10 @@ kernel void look_up_cells(
 #if RESTORE
                             film_lost,
 #endif
-                            samples + 4 * place.samples, i, &place CROWD_ARGUMENTS_OF(crowds + place.slots)
+#if CELL_HISTORY
+                            shared_light,
+#endif
+                            samples + 4 * place.samples, i, &place KNOWN_ARGUMENTS CROWD_ARGUMENTS_OF(crowds + place.slots)
                                   WALL_ARGUMENTS_OF(near_cells + place.slots));
     }
 }

@@ -17,6 +17,9 @@
 #include "common/surface.h"
 #include "common/trace.h"
 #include "common/light.h"
+#if CELL_HISTORY == 2
+#include "common/cell_history.h"
+#endif
 
 // What both kernels that trace need of the scene.
 #if SMOOTH
@@ -314,3 +317,59 @@ kernel void pool_probes(__global const Params *params, __global const Probe *pro
     }
     changes[at] = change;
 }
+
+#if CELL_HISTORY == 2
+/// Tell the cells around the vertices of probes how much the light has changed there, and all of them the
+/// largest change.  One work item W probes, after pool_probes.
+///
+/// A cell stores 1 + the change, and 0 where no probe is: three levels around that of paths, with the
+/// camera's view of this frame.
+///
+/// reads   probes, changes
+/// writes  cell_changes (atomic)
+kernel void spread_changes(
+    __global const Params *params,
+    __global const Surface *surfaces NORMAL_PARAMETERS INSTANCE_PARAMETERS,
+    __global const Probe *probes,
+    __global const float *changes,
+    volatile __global uint *cell_changes)
+{
+    const uint first = get_global_id(0) * W;
+    const uint count = probe_columns(params) * probe_rows(params);
+    if (first >= count)
+        return;
+    const UInt at = min(lanes_before(MASK_ALL) + first, (UInt)(count - 1u));
+    const UInt triangle = GATHER_U(probes, at, triangle);
+    const Mask there = triangle != NO_HIT;
+    const Vec3 wo = vec3(GATHER(probes, at, wo[0]), GATHER(probes, at, wo[1]), GATHER(probes, at, wo[2]));
+    const SurfacePoint s = surface_point(pick_u(there, triangle, (UInt)(0u)), GATHER(probes, at, u),
+                                         GATHER(probes, at, v), wo, surfaces NORMAL_ARGUMENTS INSTANCE_ARGUMENTS);
+    const Vec3 away = sub(s.p, vec3_of(params->camera_origin));
+#if LENS == 2
+    const Float length = dot3(away, vec3_of(params->camera_forward));
+#else
+    const Float length = sqrt(dot3(away, away));
+#endif
+    CellQuery query;
+    query.p = s.p;
+    query.ng = s.ng;
+    query.width = length * cell_width_of(params, params->first_pass);
+    query.seen = MASK_ALL;
+    query.near = (UInt)(0u);
+    query.extra = (UInt)(0u);
+    const Float change = 1.0f + gather_words(changes, at);
+    float lane_change[W];
+    store_lanes(change, lane_change);
+    for (uint level = 0; level < 3; ++level) {
+        const UInt entry = entry_of(params, cell_place(params, &query, (UInt)(0u), (UInt)(0u), 0, (UInt)(level - 1u)));
+        uint lane_entry[W];
+        store_lanes_u(entry, lane_entry);
+        for (uint bits = lane_bits(there); bits; bits &= bits - 1u) {
+            const uint k = lowest_bit(bits);
+            atomic_max(&cell_changes[lane_entry[k]], as_uint(lane_change[k]));
+        }
+    }
+    for (uint bits = lane_bits(there); bits; bits &= bits - 1u)
+        atomic_max(&cell_changes[params->cell_slots], as_uint(lane_change[lowest_bit(bits)]));
+}
+#endif

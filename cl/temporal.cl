@@ -8,6 +8,7 @@
 #include "common/layout.h"
 #include "common/pixels.h"
 #include "common/probes.h"
+#include "common/history.h"
 #include "common/view.h"
 
 #if TEMPORAL == 2
@@ -47,29 +48,10 @@ typedef struct {
     Vec3 base;
     Float count;
     Float square;
+#if CELL_HISTORY
+    Vec3 shared; // of that, light from cells
+#endif
 } Known;
-
-// A change from which on the frame has more than its part.
-#define CERTAIN 0.5f
-
-// Before frames have shown it, their standard deviation is taken for half of the light, as two frames would say.
-#define PRIOR_VARIANCE 0.25f
-#define PRIOR_FRAMES 2.0f
-
-/// Samples that a history is worth of which a part has changed: with N of variance v and a bias b, it errs as
-/// N / (1 + N b^2 / v) without bias.  All of them if nothing has changed.
-static inline Float worth_of(Known known, Float change, Float fresh)
-{
-    const Float level = luminance(known.rgb);
-    // A change of c of the brighter of both leaves at least 1 - c of it.
-    const Float bias = change * level / (1.0f - min(change, CERTAIN));
-    const Float frames = known.count / max(fresh, 1.0f);
-    const Float spread = max(known.square - level * level, 0.0f);
-    const Float variance =
-        (frames * spread + PRIOR_FRAMES * PRIOR_VARIANCE * level * level) / (frames + PRIOR_FRAMES);
-    const Float ratio = frames * bias * bias / max(variance, 1e-30f);
-    return pick(change > 0.0f, known.count / (1.0f + ratio), known.count);
-}
 
 /// What a pixel sees, as the tests of its history need it.
 typedef struct {
@@ -78,6 +60,14 @@ typedef struct {
     Vec3 ns;
     Float footprint; // in the frame before, m
 } Wanted;
+
+#if CELL_HISTORY
+#define SHARED_HISTORY_BUFFER , __global const float *shared_history
+#define SHARED_HISTORY_ARGUMENT , shared_history
+#else
+#define SHARED_HISTORY_BUFFER
+#define SHARED_HISTORY_ARGUMENT
+#endif
 
 /// Add what a pixel of the frame before knew, if it saw the same surface.
 static inline void add_history(
@@ -90,7 +80,7 @@ static inline void add_history(
     Mask unmoved,
     Mask still,
     Known *known,
-    Float *weights)
+    Float *weights SHARED_HISTORY_BUFFER)
 {
     const Mask inside = (weight > 0.0f) & (column >= 0.0f) & (row >= 0.0f) & (column < (float)params->crop_width)
                         & (row < (float)params->crop_height);
@@ -117,8 +107,49 @@ static inline void add_history(
     known->base = add_scaled(known->base, base, part);
     known->count += count * part;
     known->square += GATHER(history, at, square) * part;
+#if CELL_HISTORY
+    const Vec3 shared = vec3(gather_words(shared_history, at * 4u), gather_words(shared_history, at * 4u + 1u),
+                             gather_words(shared_history, at * 4u + 2u));
+    known->shared = add_scaled(known->shared, shared, part);
+#endif
     *weights += part;
 }
+
+#if CELL_HISTORY
+/// Return what cells add to the light of pixels that know less of it than they do.
+///
+/// A pixel has its own mean of what its samples took from cells; where a cell knows more frames, these are
+/// averaged in, for this picture alone.  Nothing is counted twice: in a picture that stands still no cell
+/// knows more frames than the pixels that see it.
+static inline Vec3 added_by_cells(
+    __global const SharedLight *sums,
+    UInt pixel,
+    Float fresh,
+    Float alpha,
+    Vec3 known,
+    Float *count,
+    Vec3 *mean,
+    Vec3 *base)
+{
+    const Float inverse = 1.0f / max(fresh, 1.0f);
+    const Vec3 now = scale(vec3(GATHER(sums, pixel, fresh[0]), GATHER(sums, pixel, fresh[1]),
+                                GATHER(sums, pixel, fresh[2])), inverse);
+    const Vec3 before = scale(vec3(GATHER(sums, pixel, known[0]), GATHER(sums, pixel, known[1]),
+                                   GATHER(sums, pixel, known[2])), inverse);
+    const Vec3 its_base = scale(vec3(GATHER(sums, pixel, base[0]), GATHER(sums, pixel, base[1]),
+                                     GATHER(sums, pixel, base[2])), inverse);
+    const Float frames = GATHER(sums, pixel, frames) / max(GATHER(sums, pixel, samples), 1.0f);
+    *mean = add_scaled(scale(known, 1.0f - alpha), now, alpha);
+    const Float more = max((frames + 1.0f) * fresh - *count, 0.0f);
+    *count += more;
+    const Vec3 added = scale(sub(before, *mean), more / max(*count, 1.0f));
+    const Vec3 zero = vec3_all((Float)(0.0f));
+    *base = vec3(pick(before.x > 0.0f, added.x * its_base.x / before.x, zero.x),
+                 pick(before.y > 0.0f, added.y * its_base.y / before.y, zero.y),
+                 pick(before.z > 0.0f, added.z * its_base.z / before.z, zero.z));
+    return added;
+}
+#endif
 
 /// Blend the light of this frame with what is known from the frames before.  One work item W pixels.
 ///
@@ -126,8 +157,8 @@ static inline void add_history(
 /// shape, normals that agree, each within a pixel's footprint of the plane of the other.  One that moved by
 /// whole pixels, or not at all, takes one of them as it is.
 ///
-/// reads   film, film_base, surfaces_seen, motion, history, changes
-/// writes  light
+/// reads   film, film_base, surfaces_seen, motion, history, changes; shared_light, shared_history
+/// writes  light; shared_pixels
 kernel void blend_history(
     __global const Params *params,
     __global const FilmSum *film,
@@ -139,6 +170,11 @@ kernel void blend_history(
     __global const History *history,
 #if TEMPORAL == 2
     __global const float *changes,
+#endif
+#if CELL_HISTORY
+    __global const SharedLight *shared_light,
+    __global const float *shared_history,
+    __global SharedPixel *shared_pixels,
 #endif
     __global PixelLight *light)
 {
@@ -161,6 +197,9 @@ kernel void blend_history(
     known.base = zero;
     known.count = (Float)(0.0f);
     known.square = (Float)(0.0f);
+#if CELL_HISTORY
+    known.shared = zero;
+#endif
     Float weights = (Float)(0.0f);
     Float change = (Float)(0.0f);
     if ((params->history_flags & HISTORY_THERE) && params->temporal_rule != RULE_OFF) {
@@ -193,35 +232,39 @@ kernel void blend_history(
         for (uint k = 0; k < 4; ++k) {
             const Float share = ((k & 1u) ? aside : 1.0f - aside) * ((k & 2u) ? below : 1.0f - below);
             add_history(params, history, wanted, left + (float)(k & 1u), top + (float)(k >> 1), share, unmoved,
-                        still, &known, &weights);
+                        still, &known, &weights SHARED_HISTORY_ARGUMENT);
         }
         const Float whole = pick(weights > LEAST_WEIGHT, 1.0f / max(weights, LEAST_WEIGHT), (Float)(0.0f));
         known.rgb = scale(known.rgb, whole);
         known.base = scale(known.base, whole);
         known.count = known.count * whole;
         known.square = known.square * whole;
+#if CELL_HISTORY
+        known.shared = scale(known.shared, whole);
+#endif
     }
 
-    const Mask is_known = known.count > 0.0f;
-    const Float kept = pick(is_known, worth_of(known, change, fresh), (Float)(0.0f));
-    Float alpha = fresh / max(kept + fresh, 1.0f);
-    Float count = kept + fresh;
-    if (params->temporal_rule == RULE_EXPONENTIAL) {
-        alpha = pick(is_known, (Float)(params->temporal_alpha), (Float)(1.0f));
-        count = min(count, fresh / max(alpha, 1e-6f));
-    }
-    const Mask changed = is_known & (change > 0.0f);
-    const Float part = max(change - CERTAIN, 0.0f) * (1.0f / (1.0f - CERTAIN));
-    alpha = pick(changed, alpha + part * part * (1.0f - alpha), alpha);
-    // The bias of what is kept stays, while noise goes: in the frames to come it counts for less, by the part
-    // of it that was worth keeping.
-    const Float left = fresh / max(alpha, 1e-6f) - fresh;
-    count = pick(changed, fresh + left * left / max(known.count, 1.0f), count);
-    alpha = pick(is_known, alpha, (Float)(1.0f));
-    const Vec3 mean = add_scaled(scale(known.rgb, 1.0f - alpha), rgb, alpha);
+    const Share share = share_of_frame(params, luminance(known.rgb), known.count, known.square, change, fresh);
+    const Float alpha = share.alpha;
+    Float count = share.count;
+    Vec3 mean = add_scaled(scale(known.rgb, 1.0f - alpha), rgb, alpha);
     const Float brightness = luminance(rgb);
     const Float square = (1.0f - alpha) * known.square + alpha * brightness * brightness;
-    const Vec3 base_mean = add_scaled(scale(known.base, 1.0f - alpha), base, alpha);
+    Vec3 base_mean = add_scaled(scale(known.base, 1.0f - alpha), base, alpha);
+#if CELL_HISTORY
+    const Float own = count;
+    Vec3 shared;
+    Vec3 added_base;
+    const Vec3 added =
+        added_by_cells(shared_light, pixel, fresh, alpha, known.shared, &count, &shared, &added_base);
+    mean = add(mean, added);
+    base_mean = add(base_mean, added_base);
+    const Float parts[10] = {shared.x, shared.y, shared.z, own, added.x, added.y, added.z, added_base.x,
+                             added_base.y, added_base.z};
+    float lane_parts[10][W];
+    for (uint c = 0; c < 10; ++c)
+        store_lanes(parts[c], lane_parts[c]);
+#endif
 
     const Float values[10] = {mean.x,      mean.y,      mean.z, count,  base_mean.x,
                               base_mean.y, base_mean.z, alpha,  square, change};
@@ -235,18 +278,28 @@ kernel void blend_history(
                          lane[7][k]),
                 0, words);
         vstore4((float4)(lane[8][k], lane[9][k], 0.0f, 0.0f), 2, words);
+#if CELL_HISTORY
+        __global float *its = (__global float *)(shared_pixels + first + k);
+        vstore4((float4)(lane_parts[0][k], lane_parts[1][k], lane_parts[2][k], lane_parts[3][k]), 0, its);
+        vstore4((float4)(lane_parts[4][k], lane_parts[5][k], lane_parts[6][k], 0.0f), 1, its);
+        vstore4((float4)(lane_parts[7][k], lane_parts[8][k], lane_parts[9][k], 0.0f), 2, its);
+#endif
     }
 }
 
-/// Keep the light of this frame, and what it sees, for the next.  One work item a pixel, after
-/// blend_history.
+/// Keep the light of this frame, and what it sees, for the next, without what cells added.  One work item a
+/// pixel, after blend_history.
 ///
-/// reads   light, surfaces_seen
-/// writes  history
+/// reads   light, surfaces_seen; shared_pixels
+/// writes  history; shared_history
 kernel void keep_history(
     __global const Params *params,
     __global const PixelLight *light,
     __global const SeenMean *surfaces_seen,
+#if CELL_HISTORY
+    __global const SharedPixel *shared_pixels,
+    __global float *shared_history,
+#endif
     __global History *history)
 {
     const uint pixel = get_global_id(0);
@@ -254,13 +307,23 @@ kernel void keep_history(
         return;
     __global const SeenMean *seen = &surfaces_seen[pixel];
     __global History *to = &history[pixel];
-    to->count = light[pixel].count;
+    float count = light[pixel].count;
+    float3 rgb = vload3(0, light[pixel].rgb);
+    float3 base = vload3(0, light[pixel].base);
+#if CELL_HISTORY
+    __global const SharedPixel *shared = &shared_pixels[pixel];
+    count = shared->count;
+    rgb -= vload3(0, shared->added);
+    base -= vload3(0, shared->base);
+    vstore4((float4)(vload3(0, shared->mean), 0.0f), pixel, shared_history);
+#endif
+    to->count = count;
     to->shape = seen->shape;
     to->square = light[pixel].square;
     const float3 ns = vload3(0, seen->ns);
     const float length2 = dot(ns, ns);
-    vstore3(vload3(0, light[pixel].rgb), 0, to->rgb);
-    vstore3(vload3(0, light[pixel].base), 0, to->base);
+    vstore3(rgb, 0, to->rgb);
+    vstore3(base, 0, to->base);
     vstore3(vload3(0, seen->p), 0, to->p);
     vstore3(length2 > 1e-12f ? ns / sqrt(length2) : (float3)(0.0f, 0.0f, 1.0f), 0, to->ns);
 }

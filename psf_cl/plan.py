@@ -33,6 +33,7 @@ from psf_cl.stages import (
     animate,
     cache,
     camera,
+    cell_history,
     cells,
     connect,
     film,
@@ -299,6 +300,7 @@ def make_plan(
     features["FEW"] = _few(shown, corners, traits)
     features["INSTANCES"] = _instances(levels, shown)
     features["TEMPORAL"] = _temporal(scene, settings, features)
+    features["CELL_HISTORY"] = _cell_history(settings, features)
     if full:
         features = _all_on(features)
     pixel_count = width * height
@@ -335,6 +337,7 @@ def make_plan(
         shade,
         connect,
         cells,
+        cell_history,
         range_search,
         splats,
         seen,
@@ -758,6 +761,18 @@ def _temporal(scene: Scene, settings: Settings, features: dict[str, Feature]) ->
     return Feature(2, "temporal is adaptive: probes look for changes of light")
 
 
+def _cell_history(settings: Settings, features: dict[str, Feature]) -> Feature:
+    """Return whether cells keep what they know: 2 if they ask for changes of the light."""
+    if settings.temporal == "off":
+        return Feature(0, "temporal is off")
+    if settings.path_filter != "hash_grid":
+        return Feature(0, f"path_filter is {settings.path_filter}")
+    if settings.cell_history == 0.0:
+        return Feature(0, "cell_history is 0: cells begin anew with each frame")
+    value = features["TEMPORAL"].value
+    return Feature(value, f"cells keep their light for {settings.cell_history:g} s unseen")
+
+
 def _seen(settings: Settings, outputs: frozenset[str]) -> Feature:
     """Return whether the first surfaces are kept: 2 with where they were in the frame before."""
     if settings.temporal != "off":
@@ -802,6 +817,8 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     full["SHADOW_RAYS"] = features["SHADOW_RAYS"]
     # Photons would stand for what paths bring.
     full["VIRTUAL_LIGHTS"] = features["VIRTUAL_LIGHTS"]
+    # What a cell knew would be in the picture.
+    full["CELL_HISTORY"] = features["CELL_HISTORY"]
     # Chains are another integrator, which has no images beside the one.
     full["METROPOLIS"] = features["METROPOLIS"]
     # Directions would be drawn otherwise: the image would have other noise.

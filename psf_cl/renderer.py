@@ -44,6 +44,7 @@ from psf_cl.scheduler import MAX_PASSES, Hooks, Progress, Scheduler, doubling_ep
 from psf_cl.settings import Settings, resolve
 from psf_cl.stages import (
     cache,
+    cell_history,
     cells,
     film,
     guide,
@@ -302,6 +303,7 @@ class Renderer:
                 self._change_lights()
             self.changed = self.lights_change or (self.mover is not None and self.mover.moved)
             values["history_flags"] = self._history_flags(before, values) if whole else 0
+            values["frame_time"] = time
             self._set_params(values | {"first_pass": first})
             if whole:
                 self._find_changes()
@@ -315,12 +317,16 @@ class Renderer:
             # Not what the screen filter makes of it: light would spread from frame to frame.
             for launch, items in (*self.blend_launches, *self.history_launches):
                 launch(items, film.GROUP)
+            if self.keep_cells is not None:
+                self.keep_cells(cells.buckets(self.plan.pixel_count), film.GROUP)
             for launch, items in self.probe_launches:
                 launch(items)
 
     def _find_changes(self) -> None:
         """Find where light has changed since the frame before, if that is asked for."""
         if self.changed:
+            if "cell_changes" in self.buffers:
+                self.device.fill(self.buffers["cell_changes"])
             for launch, items in self.change_launches:
                 launch(items)
         elif "changes" in self.buffers:
@@ -338,6 +344,8 @@ class Renderer:
             flags |= constants["HISTORY_SAME_VIEW"]
             if self.mover is None or not self.mover.moved:
                 flags |= constants["HISTORY_STILL"]
+        if self.changed:
+            flags |= constants["HISTORY_CHANGED"]
         return flags
 
     def _fit_tree(self) -> None:
@@ -385,6 +393,7 @@ class Renderer:
             "film_half",
             "film_lost",
             "surfaces_seen",
+            "shared_light",
             *names,
         ):
             if name in self.buffers:
@@ -918,11 +927,20 @@ class Renderer:
         names = ("failed_inserts", "rejected_cells", "unfiltered_samples")
         used, passes = layout.whole(counters, "cells_used"), max(self.scheduler.passes, 1)
         slots = cells.slots_of(self.plan.pixel_count)
-        return {name: layout.whole(counters, name) for name in names} | {
-            "cells_per_pass": used / passes,
-            "load": used / passes / slots,
-            "mean_probes": layout.whole(counters, "cell_probes") / max(used, 1),
-        }
+        kept = {}
+        if "kept_keys" in self.buffers:
+            keys = self.device.read(self.buffers["kept_keys"])
+            kept["kept"] = int(np.count_nonzero(keys))
+            kept["failed_histories"] = layout.whole(counters, "failed_histories")
+        return (
+            {name: layout.whole(counters, name) for name in names}
+            | kept
+            | {
+                "cells_per_pass": used / passes,
+                "load": used / passes / slots,
+                "mean_probes": layout.whole(counters, "cell_probes") / max(used, 1),
+            }
+        )
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -1085,6 +1103,7 @@ class Renderer:
         values |= screen.parameters(settings)
         values |= metropolis.parameters(settings, self.plan.traits.slots, self.plan.pixel_count)
         values |= temporal.parameters(settings)
+        values |= cell_history.parameters(settings, self.time)
         values |= guide.parameters(scene, settings, self.plan.pixel_count, values["scene_radius"])
         values |= cache.parameters(scene, settings, self.plan.pixel_count)
         values |= photons.parameters(settings, len(lights))
@@ -1184,7 +1203,7 @@ class Renderer:
             if not (stage.per_pass or stage.per_frame)
             for kernel in stage.kernels
         ]
-        self._bind_cells(programs.get("cells"))
+        self._bind_cells(programs.get("cells"), programs.get("cell_history"))
         self._bind_range_search(programs.get("range_search"))
         self._bind_chains(programs.get("splats"))
         if "guide" in programs:
@@ -1259,32 +1278,38 @@ class Renderer:
         count = probes.count(*self.plan.crop[2:])
         # Before the scene moves, and after it.
         self.probe_launches = launches("place_probes", "measure_probes", count=count)
-        self.change_launches = launches("measure_probes", "pool_probes", count=count)
+        self.change_launches = launches(
+            "measure_probes", "pool_probes", "spread_changes", count=count
+        )
         self.blend_launches = (
             launches("find_motion", "blend_history") if shared else launches("resolve_light")
         )
         self.picture_launches = [*self.blend_launches, *launches("filter_screen")]
 
-    def _bind_cells(self, program: Program | None) -> None:
+    def _bind_cells(self, program: Program | None, history: Program | None) -> None:
         self.cell_launches: list[tuple[Launch, int]] = []
-        self.add_unfiltered = self.clear_cells = None
+        self.add_unfiltered = self.clear_cells = self.keep_cells = None
         if program is None:
             return
         traits, pixels = self.plan.traits, self.plan.pixel_count
         per_pixel = -(-pixels // (traits.lanes * traits.run))
         per_bucket = cells.buckets(pixels)
         stage = next(stage for stage in self.plan.stages if stage.name == "cells")
+        order = (
+            (program, "count_crowds", per_pixel),
+            (program, "mark_near_cells", per_pixel),
+            (program, "store_cells", per_pixel),
+            (history, "gather_cells", per_bucket),
+            (program, "resolve_cells", per_bucket),
+            (program, "look_up_cells", per_pixel),
+        )
         self.cell_launches = [
-            (program.bind_planned(name, self.buffers), items)
-            for name, items in (
-                ("count_crowds", per_pixel),
-                ("mark_near_cells", per_pixel),
-                ("store_cells", per_pixel),
-                ("resolve_cells", per_bucket),
-                ("look_up_cells", per_pixel),
-            )
-            if name in stage.kernel_names
+            (where.bind_planned(name, self.buffers), items)
+            for where, name, items in order
+            if where is not None and (where is history or name in stage.kernel_names)
         ]
+        if history is not None:
+            self.keep_cells = history.bind_planned("keep_cells", self.buffers)
         self.clear_cells = program.bind_planned("clear_cells", self.buffers)
         self.add_unfiltered = program.bind_planned("add_unfiltered", self.buffers)
 

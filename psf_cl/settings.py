@@ -211,6 +211,13 @@ class Settings:
     temporal_alpha: float = _number(
         0.2, 1e-6, 1.0, doc="weight of the newest frame by the exponential rule"
     )
+    cell_history: float = _number(
+        2.0,
+        0.0,
+        1e9,
+        doc="with temporal and path_filter=hash_grid, seconds for which cells keep the light of "
+        "earlier frames where nobody sees them; 0: cells begin anew with each frame",
+    )
     seed: int = _number(0, 0, 0xFFFFFFFF, doc="start of every random sequence")
 
     def __post_init__(self) -> None:

@@ -77,6 +77,9 @@
 #ifndef TEMPORAL
 #error "TEMPORAL must be 0, 1 (frames share light) or 2 (and look for changes)"
 #endif
+#ifndef CELL_HISTORY
+#error "CELL_HISTORY must be 0, 1 (cells keep what they know from frame to frame) or 2 (and ask for changes)"
+#endif
 #ifndef BASE
 #error "BASE must be 0, 1 (what the first surface reflects is kept apart) or 2 (only what its base reflects)"
 #endif

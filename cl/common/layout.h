@@ -62,6 +62,7 @@
 #define HISTORY_THERE 1u // there is a frame before
 #define HISTORY_STILL 2u // neither camera nor geometry has moved since
 #define HISTORY_SAME_VIEW 4u // the camera has not moved since
+#define HISTORY_CHANGED 8u // probes have looked for changes of light since
 #define GUIDE_SIDE 8u // parts of the hemisphere a side of the square
 #define GUIDE_BINS 64u
 #define RAY_WORDS 19u // of a path, for each shadow ray after the first
@@ -391,28 +392,30 @@
 #define COUNTER_FAILED_INSERTS_HIGH 12u // high word
 #define COUNTER_REJECTED_CELLS 13u // low word; samples too large for the sums of a cell
 #define COUNTER_REJECTED_CELLS_HIGH 14u // high word
-#define COUNTER_UNFILTERED_SAMPLES 15u // low word; samples that looked for a cell and found none
-#define COUNTER_UNFILTERED_SAMPLES_HIGH 16u // high word
-#define COUNTER_CELLS_USED 17u // low word; cells with samples, summed over passes
-#define COUNTER_CELLS_USED_HIGH 18u // high word
-#define COUNTER_CELL_PROBES 19u // low word; slots looked at to find each of these once
-#define COUNTER_CELL_PROBES_HIGH 20u // high word
-#define COUNTER_CHAIN_LIMIT 21u // first path of a chain that must not be started; set by the host
-#define COUNTER_CHAIN_STARTS 22u // paths of chains that ended before the first pass
-#define COUNTER_DARK_SAMPLES 23u // low word; samples that gathered no light
-#define COUNTER_DARK_SAMPLES_HIGH 24u // high word
-#define COUNTER_GUIDE_FAILED 25u // vertices that found their part of the table of the guide full
-#define COUNTER_GUIDE_REJECTED 26u // what is not finite, or too large for the sums of the guide
-#define COUNTER_GUIDE_OFF 27u // 1 if the guide does not pay here, and is left out; set by the host
-#define COUNTER_LEARN_LIMIT 28u // first pass that the guide learns nothing from; set by the host
-#define COUNTER_CACHE_FAILED 29u // vertices that found their part of the table of the radiance cache full
-#define COUNTER_CACHE_REJECTED 30u // what is not finite, or too large for the sums of the radiance cache
-#define COUNTER_CACHE_ENDS 31u // low word; paths that ended by the radiance cache
-#define COUNTER_CACHE_ENDS_HIGH 32u // high word
-#define COUNTER_PENDING_CAMERA 33u // rays since the last film launch
-#define COUNTER_PENDING_BOUNCE 34u
-#define COUNTER_PENDING_SHADOW 35u
-#define COUNTER_FINISHED 36u // first of the ring: samples done of each pass in flight
+#define COUNTER_FAILED_HISTORIES 15u // low word; cells of passes that the cells' history had no room for
+#define COUNTER_FAILED_HISTORIES_HIGH 16u // high word
+#define COUNTER_UNFILTERED_SAMPLES 17u // low word; samples that looked for a cell and found none
+#define COUNTER_UNFILTERED_SAMPLES_HIGH 18u // high word
+#define COUNTER_CELLS_USED 19u // low word; cells with samples, summed over passes
+#define COUNTER_CELLS_USED_HIGH 20u // high word
+#define COUNTER_CELL_PROBES 21u // low word; slots looked at to find each of these once
+#define COUNTER_CELL_PROBES_HIGH 22u // high word
+#define COUNTER_CHAIN_LIMIT 23u // first path of a chain that must not be started; set by the host
+#define COUNTER_CHAIN_STARTS 24u // paths of chains that ended before the first pass
+#define COUNTER_DARK_SAMPLES 25u // low word; samples that gathered no light
+#define COUNTER_DARK_SAMPLES_HIGH 26u // high word
+#define COUNTER_GUIDE_FAILED 27u // vertices that found their part of the table of the guide full
+#define COUNTER_GUIDE_REJECTED 28u // what is not finite, or too large for the sums of the guide
+#define COUNTER_GUIDE_OFF 29u // 1 if the guide does not pay here, and is left out; set by the host
+#define COUNTER_LEARN_LIMIT 30u // first pass that the guide learns nothing from; set by the host
+#define COUNTER_CACHE_FAILED 31u // vertices that found their part of the table of the radiance cache full
+#define COUNTER_CACHE_REJECTED 32u // what is not finite, or too large for the sums of the radiance cache
+#define COUNTER_CACHE_ENDS 33u // low word; paths that ended by the radiance cache
+#define COUNTER_CACHE_ENDS_HIGH 34u // high word
+#define COUNTER_PENDING_CAMERA 35u // rays since the last film launch
+#define COUNTER_PENDING_BOUNCE 36u
+#define COUNTER_PENDING_SHADOW 37u
+#define COUNTER_FINISHED 38u // first of the ring: samples done of each pass in flight
 
 #define PHOTONS_EMITTED 0u // with any power, also one that is not finite
 #define PHOTONS_DARK 1u // drawn where their light gives none
@@ -477,7 +480,9 @@ typedef struct {
     uint screen_neighbours; // of a pixel, that the screen filter asks
     uint temporal_rule; // RULE_OFF, RULE_EXPONENTIAL, RULE_CUMULATIVE or RULE_ADAPTIVE
     float temporal_alpha; // weight of a frame, by the exponential rule
-    uint history_flags; // HISTORY_THERE, HISTORY_STILL, HISTORY_SAME_VIEW
+    float cell_history; // s, for which cells keep light that nobody sees
+    float frame_time; // s, of this frame
+    uint history_flags; // HISTORY_THERE, HISTORY_STILL, HISTORY_SAME_VIEW, HISTORY_CHANGED
     uint first_moving; // the first triangle that moves: all after it do
     uint first_pass; // of this frame; passes are counted on from frame to frame
     float previous_origin[3]; // of the camera of the frame before; world, m
@@ -835,8 +840,40 @@ typedef struct {
     uint low[3]; // of radiance; from resolve_cells on the bits of their mean, a float
     uint count; // samples
     uint high[3]; // of radiance
-    uint pad; // fills the record
+    uint change; // of the light since the frame before, the bits of a float
 } Cell;
+
+/// What a cell knows from the frames before, and what it gathers in this one.
+typedef struct {
+    float mean[3]; // radiance behind the vertices in it
+    float count; // samples that it is worth; 0 if there was no frame before
+    float sum[3]; // of the samples of this frame
+    float fresh; // these samples
+    float square; // mean of the squared luminance of frames
+    float frames; // frames that it is worth
+    float seen; // s, time of the last frame with samples in it
+    float change; // of the light since the frame before, 0 to 1
+} CellHistory;
+
+/// What the samples of a pixel took from cells: sums over them.
+typedef struct {
+    float fresh[3]; // radiance, by the averages of this frame
+    float frames; // that what was known of these cells is worth
+    float known[3]; // radiance, by what was known of them
+    float samples; // that found a cell
+    float base[3]; // of that, what the diffuse base of the first surface reflected
+    float unused; // fills the record
+} SharedLight;
+
+/// A pixel's own part of what it shows of cells, and what they add from before it was seen.
+typedef struct {
+    float mean[3]; // radiance from cells, over the frames that the pixel knows
+    float count; // samples that the pixel is worth by itself
+    float added[3]; // radiance
+    float pad; // fills the record
+    float base[3]; // of that, what the diffuse base of the first surface reflected
+    float unused; // fills the record
+} SharedPixel;
 
 /// The second moment of a cell: a 64-bit fixed-point sum.
 typedef struct {

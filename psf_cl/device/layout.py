@@ -122,7 +122,9 @@ PARAMS = Record(
     uint screen_neighbours - of a pixel, that the screen filter asks
     uint temporal_rule - RULE_OFF, RULE_EXPONENTIAL, RULE_CUMULATIVE or RULE_ADAPTIVE
     float temporal_alpha - weight of a frame, by the exponential rule
-    uint history_flags - HISTORY_THERE, HISTORY_STILL, HISTORY_SAME_VIEW
+    float cell_history - s, for which cells keep light that nobody sees
+    float frame_time - s, of this frame
+    uint history_flags - HISTORY_THERE, HISTORY_STILL, HISTORY_SAME_VIEW, HISTORY_CHANGED
     uint first_moving - the first triangle that moves: all after it do
     uint first_pass - of this frame; passes are counted on from frame to frame
     float previous_origin[3] - of the camera of the frame before; world, m
@@ -572,7 +574,48 @@ CELL = Record(
     uint low[3] - of radiance; from resolve_cells on the bits of their mean, a float
     uint count - samples
     uint high[3] - of radiance
-    uint pad - fills the record
+    uint change - of the light since the frame before, the bits of a float
+    """),
+)
+
+CELL_HISTORY = Record(
+    "CellHistory",
+    "What a cell knows from the frames before, and what it gathers in this one.",
+    _fields("""
+    float mean[3] - radiance behind the vertices in it
+    float count - samples that it is worth; 0 if there was no frame before
+    float sum[3] - of the samples of this frame
+    float fresh - these samples
+    float square - mean of the squared luminance of frames
+    float frames - frames that it is worth
+    float seen - s, time of the last frame with samples in it
+    float change - of the light since the frame before, 0 to 1
+    """),
+)
+
+SHARED_LIGHT = Record(
+    "SharedLight",
+    "What the samples of a pixel took from cells: sums over them.",
+    _fields("""
+    float fresh[3] - radiance, by the averages of this frame
+    float frames - that what was known of these cells is worth
+    float known[3] - radiance, by what was known of them
+    float samples - that found a cell
+    float base[3] - of that, what the diffuse base of the first surface reflected
+    float unused - fills the record
+    """),
+)
+
+SHARED_PIXEL = Record(
+    "SharedPixel",
+    "A pixel's own part of what it shows of cells, and what they add from before it was seen.",
+    _fields("""
+    float mean[3] - radiance from cells, over the frames that the pixel knows
+    float count - samples that the pixel is worth by itself
+    float added[3] - radiance
+    float pad - fills the record
+    float base[3] - of that, what the diffuse base of the first surface reflected
+    float unused - fills the record
     """),
 )
 
@@ -700,6 +743,9 @@ RECORDS = (
     BEYOND,
     LOST,
     CELL,
+    CELL_HISTORY,
+    SHARED_LIGHT,
+    SHARED_PIXEL,
     CELL_SQUARES,
     CELL_VIEW,
     SPLAT_SUM,
@@ -915,6 +961,8 @@ COUNTERS = (
     ("failed_inserts_high", "high word"),
     ("rejected_cells", "low word; samples too large for the sums of a cell"),
     ("rejected_cells_high", "high word"),
+    ("failed_histories", "low word; cells of passes that the cells' history had no room for"),
+    ("failed_histories_high", "high word"),
     ("unfiltered_samples", "low word; samples that looked for a cell and found none"),
     ("unfiltered_samples_high", "high word"),
     ("cells_used", "low word; cells with samples, summed over passes"),
@@ -1012,6 +1060,7 @@ CONSTANTS = (
     ("HISTORY_THERE", 1, "there is a frame before"),
     ("HISTORY_STILL", 2, "neither camera nor geometry has moved since"),
     ("HISTORY_SAME_VIEW", 4, "the camera has not moved since"),
+    ("HISTORY_CHANGED", 8, "probes have looked for changes of light since"),
     ("GUIDE_SIDE", GUIDE_SIDE, "parts of the hemisphere a side of the square"),
     ("GUIDE_BINS", GUIDE_SIDE**2, ""),
     ("RAY_WORDS", len(RAY_FIELDS), "of a path, for each shadow ray after the first"),

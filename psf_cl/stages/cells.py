@@ -175,7 +175,7 @@ def plan(context: Context) -> StageSpec | None:
         "cells",
         "light is shared by the paths that meet in a cell",
         "cells.cl",
-        flags=("AOV_CELLS", "BASE", "CELLS", "RESTORE", "SPARSE", *TRACING),
+        flags=("AOV_CELLS", "BASE", "CELLS", "CELL_HISTORY", "RESTORE", "SPARSE", *TRACING),
         kernels=kernels,
         buffers=buffers,
         traces=True,

@@ -19,6 +19,7 @@ def plan(context: Context) -> StageSpec | None:
     if context.features["TEMPORAL"].value != 2:
         return None
     probes = count(*context.crop_size)
+    spreads = (KernelSpec("spread_changes"),) if context.on("CELL_HISTORY") else ()
     return StageSpec(
         "probes",
         "a share of the paths is traced again to find where light changes",
@@ -37,11 +38,13 @@ def plan(context: Context) -> StageSpec | None:
             "BACK_FACES",
             "LENS",
             "LIGHT_SAMPLING",
+            "CELL_HISTORY",
         ),
         kernels=(
             KernelSpec("place_probes"),
             KernelSpec("measure_probes"),
             KernelSpec("pool_probes", lanes=False),
+            *spreads,
         ),
         buffers=(
             BufferSpec("probes", layout.PROBE.dtype, probes, "paths that are traced again"),

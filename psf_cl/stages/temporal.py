@@ -27,7 +27,7 @@ def plan(context: Context) -> StageSpec | None:
         "temporal",
         "frames go on with the light of those before them",
         "temporal.cl",
-        flags=("TEMPORAL", "BASE", "LENS"),
+        flags=("TEMPORAL", "CELL_HISTORY", "BASE", "LENS"),
         kernels=(KernelSpec("blend_history"), KernelSpec("keep_history", lanes=False)),
         buffers=(BufferSpec("history", history, context.pixel_count, what),),
         per_pass=True,
