@@ -17,9 +17,7 @@
 #include "common/surface.h"
 #include "common/trace.h"
 #include "common/light.h"
-#if CELL_HISTORY == 2
 #include "common/cell_history.h"
-#endif
 
 // What both kernels that trace need of the scene.
 #if SMOOTH
