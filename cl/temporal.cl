@@ -50,6 +50,7 @@ typedef struct {
     Float square;
 #if CELL_HISTORY
     Vec3 shared; // of that, light from cells
+    Vec3 older;  // the same by what cells knew before each frame
 #endif
 } Known;
 
@@ -108,28 +109,34 @@ static inline void add_history(
     known->count += count * part;
     known->square += GATHER(history, at, square) * part;
 #if CELL_HISTORY
-    const Vec3 shared = vec3(gather_words(shared_history, at * 4u), gather_words(shared_history, at * 4u + 1u),
-                             gather_words(shared_history, at * 4u + 2u));
+    const UInt first = at * 8u;
+    const Vec3 shared = vec3(gather_words(shared_history, first), gather_words(shared_history, first + 1u),
+                             gather_words(shared_history, first + 2u));
+    const Vec3 older = vec3(gather_words(shared_history, first + 4u), gather_words(shared_history, first + 5u),
+                            gather_words(shared_history, first + 6u));
     known->shared = add_scaled(known->shared, shared, part);
+    known->older = add_scaled(known->older, older, part);
 #endif
     *weights += part;
 }
 
 #if CELL_HISTORY
-/// Return what cells add to the light of pixels that know less of it than they do.
+/// What cells add to the light of pixels that know less of it than they do.
+typedef struct {
+    Vec3 mean;  // what pixels took of cells, over the frames that they know
+    Vec3 older; // the same by what cells knew before each of these frames
+    Vec3 added; // to the light of this picture
+    Vec3 base;  // of that, what the diffuse base of the first surface reflected
+    Float more; // samples that it is worth
+} Shared;
+
+/// Return it for pixels whose own history and frame are worth `count` samples.
 ///
 /// A pixel has its own mean of what its samples took from cells; where a cell knows more frames, these are
 /// averaged in, for this picture alone.  Nothing is counted twice: in a picture that stands still no cell
 /// knows more frames than the pixels that see it.
-static inline Vec3 added_by_cells(
-    __global const SharedLight *sums,
-    UInt pixel,
-    Float fresh,
-    Float alpha,
-    Vec3 known,
-    Float *count,
-    Vec3 *mean,
-    Vec3 *base)
+static inline Shared shared_by_cells(
+    __global const SharedLight *sums, UInt pixel, Float fresh, Float alpha, Known known, Float count)
 {
     const Float inverse = 1.0f / max(fresh, 1.0f);
     const Vec3 now = scale(vec3(GATHER(sums, pixel, fresh[0]), GATHER(sums, pixel, fresh[1]),
@@ -139,15 +146,17 @@ static inline Vec3 added_by_cells(
     const Vec3 its_base = scale(vec3(GATHER(sums, pixel, base[0]), GATHER(sums, pixel, base[1]),
                                      GATHER(sums, pixel, base[2])), inverse);
     const Float frames = GATHER(sums, pixel, frames) / max(GATHER(sums, pixel, samples), 1.0f);
-    *mean = add_scaled(scale(known, 1.0f - alpha), now, alpha);
-    const Float more = max((frames + 1.0f) * fresh - *count, 0.0f);
-    *count += more;
-    const Vec3 added = scale(sub(before, *mean), more / max(*count, 1.0f));
-    const Vec3 zero = vec3_all((Float)(0.0f));
-    *base = vec3(pick(before.x > 0.0f, added.x * its_base.x / before.x, zero.x),
-                 pick(before.y > 0.0f, added.y * its_base.y / before.y, zero.y),
-                 pick(before.z > 0.0f, added.z * its_base.z / before.z, zero.z));
-    return added;
+    Shared s;
+    s.mean = add_scaled(scale(known.shared, 1.0f - alpha), now, alpha);
+    // Places in cells are random: several looks are better than one.
+    s.older = add_scaled(scale(known.older, 1.0f - alpha), before, alpha);
+    s.more = max((frames + 1.0f) * fresh - count, 0.0f);
+    s.added = scale(sub(s.older, s.mean), s.more / max(count + s.more, 1.0f));
+    const Float zero = (Float)(0.0f);
+    s.base = vec3(pick(before.x > 0.0f, s.added.x * its_base.x / before.x, zero),
+                  pick(before.y > 0.0f, s.added.y * its_base.y / before.y, zero),
+                  pick(before.z > 0.0f, s.added.z * its_base.z / before.z, zero));
+    return s;
 }
 #endif
 
@@ -199,6 +208,7 @@ kernel void blend_history(
     known.square = (Float)(0.0f);
 #if CELL_HISTORY
     known.shared = zero;
+    known.older = zero;
 #endif
     Float weights = (Float)(0.0f);
     Float change = (Float)(0.0f);
@@ -241,6 +251,7 @@ kernel void blend_history(
         known.square = known.square * whole;
 #if CELL_HISTORY
         known.shared = scale(known.shared, whole);
+        known.older = scale(known.older, whole);
 #endif
     }
 
@@ -252,17 +263,16 @@ kernel void blend_history(
     const Float square = (1.0f - alpha) * known.square + alpha * brightness * brightness;
     Vec3 base_mean = add_scaled(scale(known.base, 1.0f - alpha), base, alpha);
 #if CELL_HISTORY
-    const Float own = count;
-    Vec3 shared;
-    Vec3 added_base;
-    const Vec3 added =
-        added_by_cells(shared_light, pixel, fresh, alpha, known.shared, &count, &shared, &added_base);
-    mean = add(mean, added);
-    base_mean = add(base_mean, added_base);
-    const Float parts[10] = {shared.x, shared.y, shared.z, own, added.x, added.y, added.z, added_base.x,
-                             added_base.y, added_base.z};
-    float lane_parts[10][W];
-    for (uint c = 0; c < 10; ++c)
+    const Shared shared = shared_by_cells(shared_light, pixel, fresh, alpha, known, count);
+    mean = add(mean, shared.added);
+    base_mean = add(base_mean, shared.base);
+    const Float parts[13] = {shared.mean.x,  shared.mean.y,  shared.mean.z,  count,
+                             shared.older.x, shared.older.y, shared.older.z, shared.added.x,
+                             shared.added.y, shared.added.z, shared.base.x,  shared.base.y,
+                             shared.base.z};
+    count += shared.more;
+    float lane_parts[13][W];
+    for (uint c = 0; c < 13; ++c)
         store_lanes(parts[c], lane_parts[c]);
 #endif
 
@@ -283,6 +293,7 @@ kernel void blend_history(
         vstore4((float4)(lane_parts[0][k], lane_parts[1][k], lane_parts[2][k], lane_parts[3][k]), 0, its);
         vstore4((float4)(lane_parts[4][k], lane_parts[5][k], lane_parts[6][k], 0.0f), 1, its);
         vstore4((float4)(lane_parts[7][k], lane_parts[8][k], lane_parts[9][k], 0.0f), 2, its);
+        vstore4((float4)(lane_parts[10][k], lane_parts[11][k], lane_parts[12][k], 0.0f), 3, its);
 #endif
     }
 }
@@ -315,7 +326,8 @@ kernel void keep_history(
     count = shared->count;
     rgb -= vload3(0, shared->added);
     base -= vload3(0, shared->base);
-    vstore4((float4)(vload3(0, shared->mean), 0.0f), pixel, shared_history);
+    vstore4((float4)(vload3(0, shared->mean), 0.0f), 2 * pixel, shared_history);
+    vstore4((float4)(vload3(0, shared->older), 0.0f), 2 * pixel + 1, shared_history);
 #endif
     to->count = count;
     to->shape = seen->shape;

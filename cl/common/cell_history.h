@@ -74,8 +74,12 @@ static inline void take_known(
     const Float frames = GATHER(kept_cells, at, frames);
     const Float square = GATHER(kept_cells, at, square);
     const Mask there = found & (count > 0.0f);
-    const Float worth = worth_of(luminance(mean), count, square, change, count / max(frames, 1e-6f));
-    const Float has = pick(there, factor * frames * (worth / pick(there, count, (Float)(1.0f))), (Float)(0.0f));
+    const Float fresh = max(count / max(frames, 1e-6f), 1.0f);
+    const Share share = share_of_frame(params, luminance(mean), count, square, change, fresh);
+    // Pixels have weighed their own histories against the change; on top of that comes only what is certain.
+    const Float certain = 1.0f - min(change * (1.0f / CERTAIN), 1.0f);
+    const Float part = certain * (share.kept / pick(there, count, (Float)(1.0f)));
+    const Float has = pick(there, factor * frames * part, (Float)(0.0f));
     const Mask better = has > known->frames;
     known->mean = pick_v(better, mean, known->mean);
     known->frames = pick(better, has, known->frames);

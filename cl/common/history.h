@@ -32,6 +32,7 @@ static inline Float worth_of(Float level, Float count, Float mean_square, Float 
 typedef struct {
     Float alpha; // its weight
     Float count; // samples that both are worth from then on
+    Float kept;  // samples that what was known is worth in this frame
 } Share;
 
 /// The share of a frame of `fresh` samples in what was known: its luminance, samples, and mean square of the
@@ -40,12 +41,13 @@ static inline Share share_of_frame(
     __global const Params *params, Float level, Float known, Float mean_square, Float change, Float fresh)
 {
     const Mask is_known = known > 0.0f;
-    const Float kept = pick(is_known, worth_of(level, known, mean_square, change, fresh), (Float)(0.0f));
+    Float kept = pick(is_known, worth_of(level, known, mean_square, change, fresh), (Float)(0.0f));
     Float alpha = fresh / max(kept + fresh, 1.0f);
     Float count = kept + fresh;
     if (params->temporal_rule == RULE_EXPONENTIAL) {
         alpha = pick(is_known, (Float)(params->temporal_alpha), (Float)(1.0f));
         count = min(count, fresh / max(alpha, 1e-6f));
+        kept = min(kept, fresh / max(alpha, 1e-6f) - fresh);
     }
     const Mask changed = is_known & (change > 0.0f);
     const Float part = max(change - CERTAIN, 0.0f) * (1.0f / (1.0f - CERTAIN));
@@ -55,6 +57,7 @@ static inline Share share_of_frame(
     const Float left = fresh / max(alpha, 1e-6f) - fresh;
     Share share;
     share.count = pick(changed, fresh + left * left / max(known, 1.0f), count);
+    share.kept = pick(changed, left, kept);
     share.alpha = pick(is_known, alpha, (Float)(1.0f));
     return share;
 }

@@ -869,8 +869,10 @@ typedef struct {
 typedef struct {
     float mean[3]; // radiance from cells, over the frames that the pixel knows
     float count; // samples that the pixel is worth by itself
-    float added[3]; // radiance
+    float older[3]; // the same by what cells knew before each of these frames
     float pad; // fills the record
+    float added[3]; // radiance
+    float spare; // fills the record
     float base[3]; // of that, what the diffuse base of the first surface reflected
     float unused; // fills the record
 } SharedPixel;

@@ -31,7 +31,7 @@ def plan(context: Context) -> StageSpec | None:
         BufferSpec("kept_cells", record, slots, "what cells know from the frames before"),
         BufferSpec("shared_light", layout.SHARED_LIGHT.dtype, pixels, "what pixels took of cells"),
         BufferSpec("shared_pixels", layout.SHARED_PIXEL.dtype, pixels, "its part in the picture"),
-        BufferSpec("shared_history", np.dtype(np.float32), 4 * pixels, "that of the frame before"),
+        BufferSpec("shared_history", np.dtype(np.float32), 8 * pixels, "that of the frame before"),
     )
     if context.features["CELL_HISTORY"].value == 2:
         what = "change of light in cells, and the largest"
