@@ -302,7 +302,11 @@ def make_plan(
     features["TEMPORAL"] = _temporal(scene, settings, features)
     features["CELL_HISTORY"] = _cell_history(settings, features)
     if full:
+        cell_history_alone = features["CELL_HISTORY"]
         features = _all_on(features)
+        if settings.path_filter == "range_search":
+            # There are no cells.
+            features["CELL_HISTORY"] = cell_history_alone
     pixel_count = width * height
     image = scene.environment.image
     context = Context(
@@ -800,7 +804,8 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
 
     What is on keeps its value: as an image of one texel a constant sky would be sampled otherwise.
     """
-    most = {"ALPHA": 2, "ENVIRONMENT": 2, "CELLS": 2, "BASE": 2, "SEEN": 2, "TEMPORAL": 2}
+    twos = ("ALPHA", "ENVIRONMENT", "CELLS", "CELL_HISTORY", "BASE", "SEEN", "TEMPORAL")
+    most = dict.fromkeys(twos, 2)
     full = {
         name: feature
         if feature.value
@@ -817,8 +822,6 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     full["SHADOW_RAYS"] = features["SHADOW_RAYS"]
     # Photons would stand for what paths bring.
     full["VIRTUAL_LIGHTS"] = features["VIRTUAL_LIGHTS"]
-    # What a cell knew would be in the picture.
-    full["CELL_HISTORY"] = features["CELL_HISTORY"]
     # Chains are another integrator, which has no images beside the one.
     full["METROPOLIS"] = features["METROPOLIS"]
     # Directions would be drawn otherwise: the image would have other noise.
@@ -835,6 +838,7 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
             "AOV_LIGHTS",
             "BASE",
             "CELLS",
+            "CELL_HISTORY",
             "RESTORE",
             "SEEN",
             "SPARSE",

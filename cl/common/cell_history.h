@@ -99,7 +99,7 @@ static inline CellKnown known_of(
     CellKnown known;
     known.mean = vec3_all((Float)(0.0f));
     known.frames = (Float)(0.0f);
-    if (!(params->history_flags & HISTORY_THERE))
+    if (!(params->history_flags & HISTORY_THERE) || params->temporal_rule == RULE_OFF)
         return known;
     UInt a;
     UInt b;

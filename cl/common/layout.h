@@ -508,7 +508,7 @@ typedef struct {
     float cache_steps; // fixed-point steps of a sum of radiance per unit, a power of two
     float cache_limit; // radiance from which a sample is too large for these sums
     float cache_trace; // least chance that a path goes on where a cell is known
-    uint pad[1]; // fills the record
+    uint pad[3]; // fills the record
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.
