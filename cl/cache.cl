@@ -9,6 +9,10 @@
 #define CACHE_LEAST_VISITS 16.0f
 #define CACHE_FIRST_VARIANCE 8.0f
 
+// Share of the visits that come from nearer than a cell's edge, from which on nothing is known of the cell: in
+// corners, gaps and under doors light changes within less than a cell.
+#define CACHE_MOST_NEAR 0.125f
+
 static inline float cache_sum(__global const CacheSum *sums, uint c)
 {
     return (float)sums->high[c] * 0x1p32f + (float)sums->low[c];
@@ -39,6 +43,7 @@ kernel void renew_cache(
             cache_sums[slot].high[c] = 0u;
         }
         cache_sums[slot].count = 0u;
+        cache_sums[slot].near = 0u;
     }
 }
 
@@ -73,7 +78,8 @@ kernel void freeze_cache(
         mean[c] = cache_sum(sums, c) * inverse;
     const float now = 0.2126f * mean[0] + 0.7152f * mean[1] + 0.0722f * mean[2];
     const int given_up = cache_full[slot / bucket_size(slots)] != 0u;
-    const int known = visits >= CACHE_LEAST_VISITS && now < INFINITY && !given_up;
+    const int crowded = (float)sums->near > CACHE_MOST_NEAR * visits;
+    const int known = visits >= CACHE_LEAST_VISITS && now < INFINITY && !crowded && !given_up;
     // Squares are relative to the mean that there was: now to that of now.
     float squares = visits * (1.0f + CACHE_FIRST_VARIANCE);
     if (before > 0.0f && now > 0.0f)
@@ -98,5 +104,6 @@ kernel void freeze_cache(
             sums->high[c] >>= 1;
         }
         sums->count >>= 1;
+        sums->near >>= 1;
     }
 }

@@ -564,7 +564,7 @@ kernel void shade_paths(
     cache = pick_u(cached.known & !opens, (UInt)(NO_SLOT), pick_u(opens, cached.slot, cache));
     cache_gate = pick_v(opens, vec3(inverse_reflectance(b.base_color.x), inverse_reflectance(b.base_color.y),
                                     inverse_reflectance(b.base_color.z)), cache_gate);
-    visit_cached(cache_sums, opens, cache);
+    visit_cached(cache_sums, opens, !camera_ray & (FIELD(path, PATH_HIT_T) < cached.edge), cache);
     put_u(path, PATH_CACHE, cache);
 #endif
 

@@ -97,7 +97,10 @@ def fade(sums: np.ndarray) -> None:
     Args:
         sums: records with 64-bit sums ``low`` and ``high``, and ``count``.
     """
-    count = sums["count"].reshape(len(sums), -1)
+    counts = [
+        sums[name].reshape(len(sums), -1) for name in ("count", "near") if name in sums.dtype.names
+    ]
+    count = counts[0]
     most = count.max(axis=1)
     halvings = np.zeros(len(sums), np.uint64)
     while (late := (most >> halvings.astype(np.uint32)) > MOST_VISITS).any():
@@ -108,4 +111,5 @@ def fade(sums: np.ndarray) -> None:
     whole >>= shift
     sums["low"][changed] = whole & np.uint64(0xFFFFFFFF)
     sums["high"][changed] = whole >> np.uint64(32)
-    count[changed] >>= shift.astype(np.uint32)
+    for visits in counts:
+        visits[changed] >>= shift.astype(np.uint32)

@@ -61,6 +61,7 @@ def random_sums(count):
     rng = np.random.default_rng(4)
     sums = np.zeros(count, layout.CACHE_SUM.dtype)
     sums["count"] = rng.poisson(10.0 ** rng.uniform(-1, 4, count))
+    sums["near"] = rng.binomial(sums["count"], rng.choice([0.0, 0.1, 0.2], count))
     value = sums["count"][:, None] * 10.0 ** rng.uniform(0, 8, (count, 3))
     square = sums["count"] * 256.0 * (1 + 10.0 ** rng.uniform(-1, 3, count))
     value = np.concatenate([value, square[:, None]], axis=1)
@@ -104,7 +105,8 @@ def test_frozen_cells_are_those_of_the_model(device, trace):
     again = (np.arange(512) % 2 == 0) & (now > 0)
     square[again] = value[again, 3] / 256 * (before / now[again]) ** 2
     unsure = np.clip(16 * np.maximum(square - 1, 0) / n, 0, 1)
-    known = sums["count"] >= 16
+    # Where an eighth of the visits come from nearby a cell is next to something else.
+    known = (sums["count"] >= 16) & (sums["near"] <= sums["count"] / 8)
     known[-layout.CONSTANT["BUCKET_SLOTS"] :] = False
     ends = (1 - trace) * (1 - unsure) if trace else np.ones(512)
     np.testing.assert_allclose(found["mean"], np.where(known[:, None], mean, 0), rtol=1e-5)
@@ -119,7 +121,7 @@ def test_frozen_cells_are_those_of_the_model(device, trace):
 @pytest.mark.parametrize("trace", [0.2, 0.6])
 def test_paths_that_go_on_by_chance_bring_the_same_on_average(small, plain, trace):
     image = noisy(small, 256, cache_trace=trace, cache_cell_size=4.0, **CACHE)
-    assert image.stats["cache"]["ended_paths"] > 0.01
+    assert image.stats["cache"]["ended_paths"] > 0.005
     # 16 blocks: the largest of so many standard normals is below 4 with a chance of 0.999.
     assert np.abs(z_scores(image, plain, 4)).max() < 4
     means, variances = luminance_blocks(image, 1)

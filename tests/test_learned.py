@@ -164,6 +164,14 @@ def test_cells_of_many_visits_fade_to_the_same_mean():
     assert (sums[1:] == before[1:]).all()
 
 
+def test_visits_from_nearby_fade_with_all_visits():
+    sums = np.zeros(2, layout.CACHE_SUM.dtype)
+    sums["count"], sums["near"] = 4 * MOST_VISITS, (MOST_VISITS, 0)
+    fade(sums)
+    np.testing.assert_array_equal(sums["count"], MOST_VISITS)
+    np.testing.assert_array_equal(sums["near"], [MOST_VISITS // 4, 0])
+
+
 def test_settings_that_learn_nothing_are_refused():
     with pytest.raises(InputError, match="--save-cache: nothing is learned with guiding=off"):
         table_names(Settings(), "--save-cache")

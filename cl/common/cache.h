@@ -74,13 +74,18 @@ static inline Float inverse_reflectance(Float reflectance)
     return pick(there, 1.0f / pick(there, reflectance, (Float)(1.0f)), (Float)(0.0f));
 }
 
-/// Count a visit of each cell.
-static inline void visit_cached(__global CacheSum *sums, Mask wanted, UInt slot)
+/// Count a visit of each cell; of those in `near` the path came from nearer than the cell's edge.
+static inline void visit_cached(__global CacheSum *sums, Mask wanted, Mask near, UInt slot)
 {
     uint lane_slot[W];
     store_lanes_u(slot, lane_slot);
-    for (uint left = lane_bits(wanted); left; left &= left - 1u)
-        atomic_inc((volatile __global uint *)&sums[lane_slot[lowest_bit(left)]].count);
+    const uint close = lane_bits(near);
+    for (uint left = lane_bits(wanted); left; left &= left - 1u) {
+        const uint k = lowest_bit(left);
+        atomic_inc((volatile __global uint *)&sums[lane_slot[k]].count);
+        if ((close >> k) & 1u)
+            atomic_inc((volatile __global uint *)&sums[lane_slot[k]].near);
+    }
 }
 
 /// Add radiance to the sums of cells.  What is not finite, or too large for them, is left out and counted.

@@ -906,7 +906,8 @@ typedef struct {
     uint low[4]; // of rgb over the reflectance; of the squared luminance over the mean
     uint high[4]; // of the same
     uint count; // visits
-    uint pad[3]; // fills the record
+    uint near; // of these, by paths that came from nearer than its edge
+    uint pad[2]; // fills the record
 } CacheSum;
 
 /// What a cell of the radiance cache knows, the same for a whole epoch.

@@ -661,7 +661,8 @@ CACHE_SUM = Record(
     uint low[4] - of rgb over the reflectance; of the squared luminance over the mean
     uint high[4] - of the same
     uint count - visits
-    uint pad[3] - fills the record
+    uint near - of these, by paths that came from nearer than its edge
+    uint pad[2] - fills the record
     """),
 )
 
