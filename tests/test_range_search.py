@@ -10,12 +10,14 @@ import pytest
 from scene_builder import build, camera, floor, glowing, lambertian, render, renderer
 
 from psf_cl import load_scene
+from psf_cl.device import layout
 from psf_cl.device.device import open_device
 from psf_cl.measure.bias import split_error
 from psf_cl.plan import make_plan
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.model import Light, Material
 from psf_cl.settings import Settings
+from psf_cl.stages import cells
 
 SEARCH = {"path_filter": "range_search", "filter_vertex": "1"}
 CORNELL_BOX = Path(__file__).parents[1] / "scenes" / "cornell_box.toml"
@@ -190,3 +192,88 @@ def test_balls_are_up_to_twice_as_biased_as_cells_at_the_borders_of_walls(device
     """
     bias = bias_of(device, load_scene(CORNELL_BOX, size=(64, 64)), 64, 4, np.s_[:], cell_size=8.0)
     assert 0.4 < bias["hash_grid"] / bias["range_search"] < 1.0, bias
+
+
+def cell_averages(opened, number, values):
+    """Return the averages per cell of ``values`` (n, 3) in place of the light of a pass."""
+    device, buffers, index = opened.device, opened.buffers, layout.COUNTER_INDEX
+    count, place = opened.plan.pixel_count, number & (opened.plan.ring - 1)
+    own = np.s_[place * count : (place + 1) * count]
+    beyond, gate = (
+        device.read(buffers["beyond"])[own],
+        device.read(buffers["vertices"])[own]["gate"],
+    )
+    beyond["radiance"] = gate * values
+    device.write(buffers["beyond"], beyond, place * count)
+    device.write(buffers["samples"], np.zeros(4 * count, np.float32), 4 * place * count)
+
+    def set_counters(first, finished):
+        for at, value in ((index["film_pass"], first), (index["finished"] + place, finished)):
+            device.write(buffers["counters"], np.array([value], np.uint32), at)
+
+    set_counters(number, count)
+    for launch, items in opened.cell_launches:
+        launch(items)
+    opened.clear_cells(cells.buckets(count))
+    found = device.read(buffers["samples"]).reshape(-1, 4)[own, :3].astype(np.float64)
+    set_counters(number + 1, 0)
+    return found / np.maximum(gate, 1e-9)
+
+
+def ball_averages(values, place, side, radius2):
+    """Return the averages of ``values`` over the vertices of each one's ball, by brute force."""
+    found = np.empty_like(values)
+    for first in range(0, len(place), 256):
+        part = np.s_[first : first + 256]
+        apart = ((place[part, None] - place[None]) ** 2).sum(axis=-1)
+        inside = (apart <= radius2[part, None]) & (side[part, None] == side[None])
+        found[part] = inside @ values / inside.sum(axis=1, keepdims=True)
+    return found
+
+
+@pytest.mark.slow
+def test_cells_are_no_more_biased_than_balls_that_average_as_far_away_at_borders_too(device):
+    """The mean square of the distance, measured place by place, is that of the balls: r^2 / 2.
+
+    At a border alone, light growing with the distance from it, the quotient is 0.91 by integration.
+    """
+    size, passes, balls = (48, 48), 48, 8
+    scene = load_scene(CORNELL_BOX, size=size)
+    plain = render(device, scene, 256, ["albedo"])
+    emitted = render(device, scene, 256, max_depth=0).rgb
+    values = {"cell_shrink": False, "cell_walls": False, "cell_near": False, "cell_size": 6.0}
+    opened = renderer(device, scene, path_filter="hash_grid", filter_vertex="1", **values)
+    albedo, rgb = (
+        image.reshape(-1, 3)[opened.order].astype(np.float64)
+        for image in (plain.aovs["albedo"], plain.rgb - emitted)
+    )
+    # Light without noise: only the blur is left.
+    light = np.where(albedo > 0.02, rgb / np.maximum(albedo, 0.02), 0.0)
+    count = len(light)
+    moment, vertices, bias = np.zeros(count), [], np.zeros((2, count, 3))
+    for number in range(passes):
+        opened.render(spp=number + 1)
+        first = (number & (opened.plan.ring - 1)) * count
+        beyond, vertex = (
+            opened.device.read(opened.buffers[name])[first : first + count]
+            for name in ("beyond", "vertices")
+        )
+        there = beyond["vertex"] != 0
+        # Shifted, for cells take no negative numbers.
+        place = np.where(there[:, None], vertex["p"] + 2.0, 0.0).astype(np.float64)
+        mean, square = (cell_averages(opened, number, v) for v in (place, place**2))
+        apart = (square - 2 * place * mean + place**2).sum(axis=1)
+        moment += np.where(there, apart, 0.0) / passes
+        blurred = cell_averages(opened, number, light) - light
+        bias[number & 1] += np.where(there[:, None], blurred, 0.0) * 2 / passes
+        # What has no vertex is on a side of its own.
+        vertices.append((place, np.where(there, sides_of(vertex["ng"]), 6 + np.arange(count))))
+    opened.close()
+    searched = np.zeros((2, count, 3))
+    for number, (place, side) in enumerate(vertices[:balls]):
+        blurred = ball_averages(light, place, side, 2 * np.maximum(moment, 0.0)) - light
+        searched[number & 1] += blurred * 2 / balls
+    # Products of independent halves hold no noise.
+    cell_bias, ball_bias = (np.mean(parts[0] * parts[1]) for parts in (bias, searched))
+    assert ball_bias > 0
+    assert 0.55 < cell_bias / ball_bias < 1.25
