@@ -1,0 +1,106 @@
+"""A sheet of pictures of many lights at equal times: ``python tools/light_picture.py -o FILE.png``.
+
+Each column is a way of choosing lights, alone or with the screen filter over the picture; each row
+a time, of all processors: a second of the machine is as many processor seconds as it has cores, so
+that other programs hardly matter.  Compiling and loading do not count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+import PIL.ImageDraw
+
+import psf_cl
+from psf_cl.cli.common import positive_number
+from psf_cl.device.device import Device, open_device
+from psf_cl.errors import DeviceError, InputError
+from psf_cl.image import Image, read_exr, tone_map, write_png_pixels
+from psf_cl.measure.errors import compare
+from psf_cl.renderer import Renderer
+from psf_cl.scene.model import Scene
+from psf_cl.settings import resolve
+
+MANY_LIGHTS = Path(__file__).parents[1] / "scenes" / "many_lights.toml"
+SIZE = (160, 100)
+SECONDS = (1.0, 4.0)
+BAR = 14
+
+#: What is compared, by the names of its columns.
+WAYS = {
+    "light hierarchy": {"light_sampling": "hierarchy"},
+    "photons": {"light_sampling": "photon"},
+    "hierarchy, filtered": {"light_sampling": "hierarchy", "screen_filter": "path_space"},
+    "photons, filtered": {"light_sampling": "photon", "screen_filter": "path_space"},
+}
+
+
+def render_for(scene: Scene, device: Device, values: dict[str, str], seconds: float) -> Image:
+    """Return the picture after so many processor seconds, or after the first pass."""
+    renderer = Renderer(scene, resolve(scene.render, scene.path, None, values), device)
+    end = time.process_time() + seconds
+    renderer.render(spp=1 << 20, progress=lambda now: now.passes < 1 or time.process_time() < end)
+    image = renderer.image()
+    renderer.close()
+    return image
+
+
+def sheet(
+    pictures: Sequence[Sequence[np.ndarray]], captions: Sequence[Sequence[str]]
+) -> np.ndarray:
+    """Return rows of pictures ``(h, w, 3)`` uint8, with a caption above each."""
+    height, width = pictures[0][0].shape[:2]
+    rows, columns = len(pictures), len(pictures[0])
+    page = PIL.Image.new("RGB", (columns * width, rows * (height + BAR)), "white")
+    draw = PIL.ImageDraw.Draw(page)
+    for row in range(rows):
+        for column in range(columns):
+            left, top = column * width, row * (height + BAR)
+            draw.text((left + 3, top + 1), captions[row][column], fill="black")
+            page.paste(PIL.Image.fromarray(pictures[row][column]), (left, top + BAR))
+    return np.asarray(page)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Render and write the sheet; print what each picture is worth."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.png")
+    parser.add_argument("--seconds", type=positive_number, nargs="+", default=SECONDS)
+    parser.add_argument("--exposure", type=float, default=0.0, help="stops")
+    parser.add_argument("--reference", type=Path, metavar="FILE.exr", help="to say the relMSE")
+    args = parser.parse_args(arguments)
+    reference = read_exr(args.reference).rgb if args.reference else None
+    size = SIZE if reference is None else (reference.shape[1], reference.shape[0])
+    scene, device = psf_cl.load_scene(MANY_LIGHTS, size=size), open_device()
+    cores = os.cpu_count() or 1
+    pictures, captions = [], []
+    for seconds in args.seconds:
+        images = [render_for(scene, device, way, seconds * cores) for way in WAYS.values()]
+        texts = []
+        for name, image in zip(WAYS, images, strict=True):
+            text = f"{name}, {seconds:g} s"
+            texts.append(text)
+            text += f", {image.stats['spp']} spp"
+            if reference is not None:
+                text += f", relMSE {compare(image.rgb, reference).relmse:.3f}"
+            print(text)
+        pictures.append([tone_map(image.rgb, args.exposure) for image in images])
+        captions.append(texts)
+    write_png_pixels(args.output, sheet(pictures, captions))
+    return 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except (InputError, DeviceError) as error:
+        sys.exit(f"light_picture: {error}")
