@@ -1,9 +1,10 @@
 """Measure what fitting a tree to a deforming mesh costs: ``refit_speed.py``.
 
 A bumpy ball is twisted by its joints, frame by frame.  For each frame: the cost of the tree by
-surfaces, relative to when it was built; seconds to move the vertices, to fit the tree, and to build
-another one; and what the rays of paths take, relative to those of a renderer that has built its
-tree for the frame (medians of interleaved rounds).  It ends where another tree falls due.
+surfaces, relative to when it was built; processor seconds to move the vertices, to fit the tree,
+and to build another one, those of a CPU device included; and what the rays of paths take, relative
+to those of a renderer that has built its tree for the frame (medians of interleaved rounds).  It
+ends where another tree falls due.
 """
 
 from __future__ import annotations
@@ -75,25 +76,33 @@ def twisting(rows: int, size: int, twist: float) -> Scene:
 
 
 def seconds_of(device: Device, work: Callable[[], object]) -> float:
-    """Return the seconds that ``work`` takes, on the device too."""
+    """Return the processor seconds that ``work`` takes, those of a CPU device included."""
     device.wait()
-    start = time.perf_counter()
+    start = time.process_time()
     work()
     device.wait()
-    return time.perf_counter() - start
+    return time.process_time() - start
 
 
 def trace_seconds(opened: Renderer, spp: int) -> float:
-    """Return the seconds that the device traces rays for ``spp`` more samples a pixel."""
+    """Return the processor seconds that rays take for ``spp`` more samples a pixel.
 
-    def total() -> float:
+    Their share in the time of all kernels says how much of it they are.
+    """
+
+    def totals() -> np.ndarray:
         spent = opened.device.totals
         names = ("intersect_closest", "connect_lights")
-        return sum(spent[name].seconds for name in names if name in spent)
+        rays = sum(spent[name].seconds for name in names if name in spent)
+        return np.array((rays, sum(one.seconds for one in spent.values())))
 
-    before = total()
-    opened.render(spp=opened.scheduler.passes + spp)
-    return total() - before
+    # Trees that were fitted or built before are none of it.
+    opened.device.wait()
+    opened.device.collect_events()
+    before, passes = totals(), opened.scheduler.passes
+    seconds = seconds_of(opened.device, lambda: opened.render(spp=passes + spp))
+    rays, everything = totals() - before
+    return seconds * float(rays / everything)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -131,6 +140,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ratio = refit.cost_ratio()
         fresh = Renderer(baked(scene, float(frame)), Settings(), device, statistics=True)
         fit, built, slower = [], [], []
+        for one in (opened, fresh):
+            trace_seconds(one, args.spp)
         for _ in range(args.rounds):
             fit.append(seconds_of(device, lambda: refit.fit(positions)))
             built.append(seconds_of(device, build))
