@@ -249,7 +249,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 verdict,
                 case.differs,
             )
-            print(f"{case.name}, {shape}: {verdict}", file=sys.stderr)
+            ratio = " ".join(f"{value:.4f}" for value in result.ratio)
+            print(f"{case.name}, {shape}: {verdict}, {ratio}", file=sys.stderr)
     Console(width=max(140, Console().width)).print(table)
     return 0 if passed else 1
 
