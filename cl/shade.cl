@@ -21,6 +21,9 @@
 
 #define MAX_SURVIVAL 0.999f
 
+// Of the directions, how large a part textures are averaged over.
+#define FOOTPRINT_SHARE (1.0f / 256.0f)
+
 /// Weight of emission that a BSDF-sampled ray found, against sampling the light.
 static inline Float emission_weight(__global const Params *params, Mask camera_ray, Float pdf_bsdf, Float pdf_light)
 {
@@ -320,6 +323,13 @@ kernel void shade_paths(
                                    , normals
 #endif
                                    INSTANCE_ARGUMENTS);
+#if TEXTURE_LEVELS
+    // A path stands for all directions near its own: the more, the less densely they are drawn.  Footprints:
+    // Suykens, Willems: Path Differentials and Applications, 2000; here by the density.
+    const Float reach = FIELD(path, PATH_HIT_T);
+    const Float spread = reach * reach / (max(pdf_bsdf, 1e-6f) * max(fabs(dot3(s.ng, wo)), 0.1f));
+    s.footprint = pick(camera_ray | !hit, (Float)(0.0f), FOOTPRINT_SHARE * spread * density_scale(s INSTANCE_ARGUMENTS));
+#endif
 #if TRANSMISSION
     beta = mul(beta, attenuation(hit, s, FIELD(path, PATH_HIT_T), materials));
 #endif

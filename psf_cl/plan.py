@@ -54,9 +54,10 @@ from psf_cl.stages import (
 from psf_cl.stages.spec import BufferSpec, Context, Feature, StageSpec
 from psf_cl.tables import (
     count_rectangles,
-    distinct_images,
+    count_texels,
     few_triangles,
     flatten,
+    leveled_textures,
     light_spread,
     visible_shapes,
 )
@@ -309,6 +310,7 @@ def make_plan(
             features["CELL_HISTORY"] = cell_history_alone
     pixel_count = width * height
     image = scene.environment.image
+    textures, texels = count_texels(scene, bool(features["TEXTURE_LEVELS"].value))
     context = Context(
         features,
         traits,
@@ -324,8 +326,8 @@ def make_plan(
         instance_count=0 if levels is None else levels.instance_count,
         corner_count=corners,
         material_count=len(scene.materials),
-        texture_count=len(scene.textures),
-        texel_count=sum(image.size // 4 for image in distinct_images(scene.textures)),
+        texture_count=textures,
+        texel_count=texels,
         environment_count=image.shape[0] * image.shape[1]
         if image is not None and features["ENVIRONMENT"].value == 2
         else 0,
@@ -523,6 +525,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "a material has a texture" if textured else "alpha is looked up as a texture's",
             "no material has a texture",
         ),
+        "TEXTURE_LEVELS": _texture_levels(scene, settings),
         "ALPHA": Feature(
             (2 if blended else 1) if cut_out else 0,
             ("a material blends" if blended else "a material is cut out by its alpha")
@@ -617,6 +620,18 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "integrator is path",
         ),
     }
+
+
+def _texture_levels(scene: Scene, settings: Settings) -> Feature:
+    """Return whether later vertices look up smaller textures, and why."""
+    if settings.texture_level == "full":
+        return Feature(0, "texture_level is full")
+    if settings.max_depth == 0:
+        return Feature(0, "max_depth is 0: there are no later vertices")
+    count = len(leveled_textures(scene))
+    if not count:
+        return Feature(0, "no material has a texture of more than a texel that may be blurred")
+    return Feature(1, f"later vertices see {count} textures as coarsely as paths are apart")
 
 
 def _rectangles(scene: Scene, settings: Settings, connected: bool) -> Feature:
@@ -822,6 +837,8 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     full["SHADOW_RAYS"] = features["SHADOW_RAYS"]
     # Photons would stand for what paths bring.
     full["VIRTUAL_LIGHTS"] = features["VIRTUAL_LIGHTS"]
+    # Other texels would be read.
+    full["TEXTURE_LEVELS"] = features["TEXTURE_LEVELS"]
     # Chains are another integrator, which has no images beside the one.
     full["METROPOLIS"] = features["METROPOLIS"]
     # Directions would be drawn otherwise: the image would have other noise.

@@ -997,7 +997,9 @@ class Renderer:
             self.plan.features["RECTANGLES"].value > 0,
         )
         textures, texels = tables.texture_tables(
-            scene.textures if "textures" in planned else (), geometry.count
+            scene.textures if "textures" in planned else (),
+            geometry.count,
+            tables.leveled_textures(scene) if self.plan.features["TEXTURE_LEVELS"].value else (),
         )
         few = None
         if self.plan.features["FEW"].value:

@@ -118,6 +118,11 @@ class Settings:
         "solid_angle",
         doc="how points of rectangular lights are drawn: uniformly, or as they are seen",
     )
+    texture_level: str = _choice(
+        "full",
+        "footprint",
+        doc="texels behind the first surface: all, or as coarse as paths are apart (biased)",
+    )
     termination: str = _choice(
         "roulette",
         "off",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,7 +30,7 @@ from psf_cl.scene.model import (
     is_invisible,
     shines,
 )
-from psf_cl.scene.texture import decoded_srgb, mean_color
+from psf_cl.scene.texture import decoded_srgb, level_sizes, mean_color, smaller_levels
 from psf_cl.scene.transform import transform_points
 
 #: Chance that the light table keeps for emitters of finite size where there is also light from
@@ -125,7 +126,9 @@ def flatten(scene: Scene) -> Geometry:
             normals.append(_corner_records(layout.NORMALS, "n", world_normals, mesh, 0.0))
         if mapped:
             for part, values in zip(uvs, (mesh.uvs, mesh.uvs1), strict=True):
-                part.append(_corner_records(layout.UVS, "uv", values, mesh, 0.0))
+                record = _corner_records(layout.UVS, "uv", values, mesh, 0.0)
+                record["density"] = _density(record, surface)
+                part.append(record)
         if colored:
             colors.append(_corner_records(layout.VERTEX_COLORS, "c", mesh.colors, mesh, 1.0))
         if directed:
@@ -364,13 +367,61 @@ def srgb_to_linear() -> np.ndarray:
     return decoded_srgb(np.arange(256) / 255.0).astype(np.float32)
 
 
+def _density(uvs: np.ndarray, surfaces: np.ndarray) -> np.ndarray:
+    """Return the area of triangles in coordinates over that in the scene, 0 where it is no number.
+
+    Args:
+        uvs, surfaces: ``(n,)`` layout.UVS and layout.SURFACE.
+    """
+    with np.errstate(all="ignore"):
+        a, b = (uvs[name].astype(np.float64) - uvs["uv0"] for name in ("uv1", "uv2"))
+        e1, e2 = (surfaces[name].astype(np.float64) for name in ("e1", "e2"))
+        covered = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+        density = covered / np.linalg.norm(np.cross(e1, e2), axis=1)
+        return np.where((density > 1e-30) & (density < 1e30), density, 0.0)
+
+
+#: What of a material may be averaged over texels: no directions, nothing that lights are drawn by.
+_LEVELED = tuple(
+    name
+    for name in TEXTURE_FIELDS
+    if name not in ("normal_texture", "anisotropy_texture", "emission_texture")
+)
+
+
+def leveled_textures(scene: Scene) -> list[int]:
+    """Return which textures have levels: those of numbers and colours, if larger than a texel."""
+    used = {getattr(material, name) for material in scene.materials for name in _LEVELED}
+    return [
+        index
+        for index in sorted(used - {-1})
+        if scene.textures[index].filter != "nearest"
+        and max(scene.textures[index].pixels.shape[:2]) > 1
+    ]
+
+
+def count_texels(scene: Scene, leveled: bool) -> tuple[int, int]:
+    """Return the rows of the table of textures and the texels, with their levels or without."""
+    rows = len(scene.textures)
+    texels = sum(image.size // 4 for image in distinct_images(scene.textures))
+    for index in leveled_textures(scene) if leveled else []:
+        height, width = scene.textures[index].pixels.shape[:2]
+        sizes = level_sizes(width, height)
+        rows += len(sizes)
+        texels += sum(w * h for w, h in sizes)
+    return rows, texels
+
+
 def texture_tables(
-    textures: tuple[Texture, ...], triangle_count: int = 0
+    textures: tuple[Texture, ...], triangle_count: int = 0, leveled: Sequence[int] = ()
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return ``(n,)`` layout.TEXTURE and all texels, ``(m, 4)`` uint8; an image lies there once.
 
+    Behind the textures are the levels of those that have them, each half as large as the last.
+
     Args:
         triangle_count: of the scene: where the second set of coordinates begins.
+        leveled: indices of the textures that have levels.
     """
     table = np.zeros(max(len(textures), 1), layout.TEXTURE.dtype)
     table["width"] = table["height"] = 1
@@ -395,6 +446,19 @@ def texture_tables(
         row["matrix"] = texture.transform
         row["uv_offset"] = triangle_count * texture.uv_set
     texels = [image.reshape(-1, 4) for image in images]
+    rows = [table]
+    for index in leveled:
+        row, texture = table[index], textures[index]
+        row["smaller"] = sum(len(part) for part in rows)
+        levels = smaller_levels(texture)
+        part = np.repeat(row[None], len(levels))
+        part["smaller"] = 0
+        for record, level in zip(part, levels, strict=True):
+            record["height"], record["width"] = level.shape[:2]
+            record["offset"] = sum(len(image) for image in texels)
+            texels.append(level.reshape(-1, 4))
+        rows.append(part)
+    table = np.concatenate(rows)
     return table, np.concatenate(texels) if texels else np.full((1, 4), 255, np.uint8)
 
 

@@ -499,6 +499,7 @@ def test_plan_follows_the_options(all_features, capsys):
         "SPARSE",
         "TANGENTS",
         "TEMPORAL",
+        "TEXTURE_LEVELS",
         "VERTEX_COLORS",
         "WALLS",
     }

@@ -265,6 +265,7 @@ def test_every_flag_at_once_renders(wants):
         cell_min_count=2,
         termination="cache",
         area_sampling="solid_angle",
+        texture_level="footprint",
         shadow_rays="2",
     )
     # Chains of paths would leave out what samples of pixels are for, places the list of triangles.

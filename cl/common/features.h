@@ -7,6 +7,9 @@
 #ifndef TEXTURES
 #error "TEXTURES must be 0 or 1"
 #endif
+#ifndef TEXTURE_LEVELS
+#error "TEXTURE_LEVELS must be 0 or 1 (later vertices look up smaller textures)"
+#endif
 #ifndef ALPHA
 #error "ALPHA must be 0 (none), 1 (masks) or 2 (also blending)"
 #endif

@@ -610,7 +610,8 @@ typedef struct {
     float uv0[2]; // first corner
     float uv1[2]; // second corner
     float uv2[2]; // third corner
-    float pad[2]; // fills the record
+    float density; // area in coordinates over area, 1/m^2
+    float pad; // fills the record
 } Uvs;
 
 /// Colours of a triangle's corners; they multiply the base colour.
@@ -672,7 +673,7 @@ typedef struct {
     uint flags; // TEXTURE_* bits: wrap of u and v, nearest, sRGB
     float matrix[6]; // rows of the transform of (u, v, 1)
     uint uv_offset; // to be added to a triangle's index, for its set of coordinates
-    uint pad; // fills the record
+    uint smaller; // of its levels of half the size and less, the first; 0 for none
 } TextureInfo;
 
 /// An emitter of the light table, with all that sampling it needs; two cache lines.

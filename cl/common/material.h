@@ -13,7 +13,13 @@
 
 // The texture `member` of material `m` at a point of a triangle; `alpha` gets its fourth channel.
 #define LOOK_UP(mask, m, member, alpha)                                                            \
-    look_up_lanes(mask, GATHER_U(materials, m, member), s.triangle, u, v TEXTURE_ARGUMENTS, alpha)
+    look_up_lanes(mask, TEXTURE_OF(mask, m, member), s.triangle, u, v TEXTURE_ARGUMENTS, alpha)
+#if TEXTURE_LEVELS
+#define TEXTURE_OF(mask, m, member)                                                                \
+    level_for(mask, GATHER_U(materials, m, member), s.triangle, s.footprint, uvs, textures)
+#else
+#define TEXTURE_OF(mask, m, member) GATHER_U(materials, m, member)
+#endif
 
 #if AREA_LIGHTS
 /// Radiance that the lanes of `mask` give away, on either side.
@@ -148,7 +154,7 @@ static inline Bsdf fetch_bsdf(
     Bsdf b;
     b.base_color = GATHER_COLOR(materials, s.material, base_color);
 #if TEXTURES
-    b.base_color = textured(mask, b.base_color, GATHER_U(materials, s.material, base_color_texture), s.triangle,
+    b.base_color = textured(mask, b.base_color, TEXTURE_OF(mask, s.material, base_color_texture), s.triangle,
                             u, v TEXTURE_ARGUMENTS);
 #endif
 #if VERTEX_COLORS

@@ -17,6 +17,9 @@ typedef struct {
     UInt triangle;
     UInt material;
     UInt light;       // NO_LIGHT if it does not emit
+#if TEXTURE_LEVELS
+    Float footprint;  // m^2 that textures are averaged over; 0 for none
+#endif
 #if INSTANCES
     UInt instance;
 #endif
@@ -93,6 +96,9 @@ LARGE_FUNCTION SurfacePoint surface_point(
     INSTANCE_PARAMETERS)
 {
     SurfacePoint s;
+#if TEXTURE_LEVELS
+    s.footprint = (Float)(0.0f);
+#endif
 #if INSTANCES
     s.instance = triangle >> (uint)INSTANCES;
     triangle -= GATHER_U(instances, s.instance, base);
@@ -147,6 +153,21 @@ LARGE_FUNCTION SurfacePoint surface_point(
 #endif
     return s;
 }
+
+#if TEXTURE_LEVELS
+/// Area on a mesh over that in the world.
+static inline Float density_scale(SurfacePoint s INSTANCE_PARAMETERS)
+{
+#if INSTANCES
+    const Vec3 x = GATHER_VECTOR(instances, s.instance, x_row);
+    const Vec3 y = GATHER_VECTOR(instances, s.instance, y_row);
+    const Vec3 z = GATHER_VECTOR(instances, s.instance, z_row);
+    return 3.0f / max(dot3(x, x) + dot3(y, y) + dot3(z, z), 1e-30f);
+#else
+    return (Float)(1.0f);
+#endif
+}
+#endif
 
 /// Origin for a ray that leaves `s` along `wi`: off the surface, on the side that wi is on.
 static inline Vec3 ray_origin(SurfacePoint s, Vec3 wi)

@@ -234,6 +234,39 @@ static inline Vec3 textured(
     return mul(color, look_up_lanes(mask, texture, triangle, u, v, uvs, textures, texels, srgb_to_linear, &alpha));
 }
 
+#if TEXTURE_LEVELS
+/// Whole part of the binary logarithm of x >= 1; large where x is no number.
+static inline UInt whole_log2(Float x) { return ((as_bits(x) >> 23) & 255u) - 127u; }
+
+/// The level of `texture` whose texels are about as large as `footprint`, in m^2, on a triangle.
+static inline UInt level_for(
+    Mask mask,
+    UInt texture,
+    UInt triangle,
+    Float footprint,
+    __global const Uvs *uvs,
+    __global const TextureInfo *textures)
+{
+    mask &= (texture != NO_TEXTURE) & (footprint > 0.0f);
+    if (!any_lane(mask))
+        return texture;
+    const UInt index = pick_u(mask, texture, (UInt)(0u));
+    const UInt smaller = GATHER_U(textures, index, smaller);
+    mask &= smaller != 0u;
+    if (!any_lane(mask))
+        return texture;
+    const UInt at = pick_u(mask, triangle + GATHER_U(textures, index, uv_offset), (UInt)(0u));
+    const Float width = to_float(GATHER_U(textures, index, width));
+    const Float height = to_float(GATHER_U(textures, index, height));
+    const Float turn = fabs(GATHER(textures, index, matrix[0]) * GATHER(textures, index, matrix[4])
+                            - GATHER(textures, index, matrix[1]) * GATHER(textures, index, matrix[3]));
+    const Float covered = footprint * GATHER(uvs, at, density) * turn * width * height;
+    const UInt last = whole_log2(max(width, height));
+    const UInt level = min(whole_log2(max(covered, 1.0f)) >> 1, last);
+    return pick_u(mask & (level > 0u), smaller + level - 1u, texture);
+}
+#endif
+
 #if VERTEX_COLORS
 /// Colour at a point of a triangle.
 static inline Vec3 corner_color(UInt triangle, Float u, Float v, __global const VertexColors *colors)

@@ -284,7 +284,8 @@ UVS = Record(
     float uv0[2] - first corner
     float uv1[2] - second corner
     float uv2[2] - third corner
-    float pad[2] - fills the record
+    float density - area in coordinates over area, 1/m^2
+    float pad - fills the record
     """),
 )
 
@@ -358,7 +359,7 @@ TEXTURE = Record(
     uint flags - TEXTURE_* bits: wrap of u and v, nearest, sRGB
     float matrix[6] - rows of the transform of (u, v, 1)
     uint uv_offset - to be added to a triangle's index, for its set of coordinates
-    uint pad - fills the record
+    uint smaller - of its levels of half the size and less, the first; 0 for none
     """),
 )
 

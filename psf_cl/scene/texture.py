@@ -99,3 +99,45 @@ def mean_color(texture: Texture) -> np.ndarray:
     values = decoded_srgb(codes) if texture.srgb else codes
     counts = [np.bincount(texture.pixels[..., c].ravel(), minlength=256) for c in range(3)]
     return np.stack(counts) @ values / max(texture.pixels[..., 0].size, 1)
+
+
+def level_sizes(width: int, height: int) -> list[tuple[int, int]]:
+    """Return the sizes of the levels of an image below its own, down to one texel."""
+    sizes = []
+    while max(width, height) > 1:
+        width, height = max(width // 2, 1), max(height // 2, 1)
+        sizes.append((width, height))
+    return sizes
+
+
+def smaller_levels(texture: Texture) -> list[np.ndarray]:
+    """Return the levels of a texture below its own: means over areas, of linear values.
+
+    Each is ``(height, width, 4)`` uint8, coded as the texture is.
+    """
+    codes = np.arange(256) / 255.0
+    decode = (decoded_srgb(codes) if texture.srgb else codes).astype(np.float32)
+    planes = [decode[texture.pixels[..., c]] for c in range(3)]
+    planes.append(texture.pixels[..., 3] / np.float32(255.0))
+    levels = []
+    for width, height in level_sizes(texture.pixels.shape[1], texture.pixels.shape[0]):
+        planes = [_shrunk(_shrunk(plane, height).T, width).T for plane in planes]
+        linear = np.clip(np.stack(planes, axis=-1), 0.0, 1.0)
+        if texture.srgb:
+            color = linear[..., :3]
+            coded = np.where(color <= 0.0031308, 12.92 * color, 1.055 * color ** (1 / 2.4) - 0.055)
+            linear = np.concatenate([coded, linear[..., 3:]], axis=-1)
+        levels.append(np.rint(255.0 * linear).astype(np.uint8))
+    return levels
+
+
+def _shrunk(rows: np.ndarray, count: int) -> np.ndarray:
+    """Return means of ``(n, m)`` rows over ``count`` parts of equal length, n or half of it."""
+    n = len(rows)
+    if n == count:
+        return rows
+    if n == 2 * count:
+        return 0.5 * (rows[::2] + rows[1::2])
+    edges = np.arange(count + 1)[:, None] * (n / count)
+    covered = np.clip(edges - np.arange(n), 0.0, 1.0)
+    return ((covered[1:] - covered[:-1]) * (count / n)).astype(np.float32) @ rows

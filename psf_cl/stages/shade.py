@@ -36,6 +36,7 @@ def plan(context: Context) -> StageSpec:
         flags=(
             "INSTANCES",
             "TEXTURES",
+            "TEXTURE_LEVELS",
             "SMOOTH",
             "GLOSSY",
             "TRANSMISSION",
