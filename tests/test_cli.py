@@ -486,6 +486,7 @@ def test_plan_follows_the_options(all_features, capsys):
         "BASE",
         "CACHE",
         "CELLS",
+        "CELL_HISTORY",
         "FEW",
         "GUIDE",
         "INSTANCES",
