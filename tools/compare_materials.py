@@ -87,7 +87,12 @@ def cases() -> list[Case]:
     )
     for ior in (1.33, 1.5, 2.4):
         glass = Material(base_color=WHITE, transmission=1.0, roughness=0.0, ior=ior)
-        found.append(Case(f"dielectric, {ior}", glass, {"type": "dielectric", "int_ior": ior}))
+        clear = {"type": "dielectric", "int_ior": ior}
+        found.append(Case(f"dielectric, {ior}", glass, clear, shapes=("sphere",)))
+        sharp = f"facets of alpha {SHARPEST_ALPHA} turn what goes to and fro inside for 32 bounces"
+        found.append(Case(f"dielectric, {ior}", glass, clear, sharp, ("slab",)))
+        rough = {"type": "roughdielectric", "int_ior": ior} | _microfacets(0.0)
+        found.append(Case(f"roughdielectric, {ior}, 0.0", glass, rough))
         found.append(
             Case(
                 f"thindielectric, {ior}",
