@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,16 +18,18 @@ from scene_builder import (
     renderer,
 )
 
+from psf_cl import load_scene
 from psf_cl.device import layout
 from psf_cl.device.device import open_device
 from psf_cl.errors import InputError
 from psf_cl.plan import make_plan
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.model import Environment, Material
-from psf_cl.settings import Settings
+from psf_cl.settings import Settings, preset_values
 from psf_cl.stages.cells import VIEWS
 
 FILTER = {"path_filter": "hash_grid"}
+CORNELL_BOX = Path(__file__).parents[1] / "scenes" / "cornell_box.toml"
 
 
 def room(size=(24, 16), **values):
@@ -449,3 +452,15 @@ def test_switches_and_numbered_choices_are_read_from_text_and_files():
     for values in ({"filter_direct": "maybe"}, {"filter_direct": 1}, {"filter_vertex": 0}):
         with pytest.raises(InputError):
             Settings().with_values(values)
+
+
+@pytest.mark.parametrize("vertex", ["1", "2"])
+def test_all_sides_of_a_room_of_few_cells_find_room_near_where_probing_starts(device, vertex):
+    scene = load_scene(CORNELL_BOX, size=(64, 64))
+    opened = renderer(device, scene, **preset_values("psf") | {"filter_vertex": vertex})
+    opened.render(spp=1)
+    cells = opened.stats()["cells"]
+    opened.close()
+    assert cells["cells_per_pass"] > 200
+    assert cells["failed_inserts"] == cells["unfiltered_samples"] == 0
+    assert 1.0 <= cells["mean_probes"] < 2.0

@@ -132,7 +132,8 @@ static inline Vec3 cell_middle(CellPlace place)
 
 /// Return where in the table what is asked for is; `wall` is 0 or tells apart what a wall separates.
 ///
-/// Blocks of 2 x 2 x 2 cells share a bucket, for neighbours are looked up together.
+/// Blocks of 2 x 2 x 2 cells share a bucket, for neighbours are looked up together; each side has its own,
+/// for where all of them come together one would not hold them.
 static inline CellKey cell_key(__global const Params *params, const CellQuery *q, CellPlace place, UInt wall)
 {
     const UInt x = place.x;
@@ -141,7 +142,8 @@ static inline CellKey cell_key(__global const Params *params, const CellQuery *q
     const UInt side = place.side + 8u * q->near + 16u * wall;
     const UInt corner = (x & 1u) | ((y & 1u) << 1) | ((z & 1u) << 2);
     const UInt index = mix_bits((x >> 1) * 0x9e3779b1u + (y >> 1) * 0x85ebca77u + (z >> 1) * 0xc2b2ae3du
-                                + place.level * 0x27d4eb2fu + q->extra * 0x165667b1u);
+                                + place.level * 0x27d4eb2fu + (q->extra * 8u + place.side) * 0x165667b1u
+                                + wall * 0xd3a2646du);
     const UInt print = mix_bits_too((x >> 1) * 0x2c1b3c6du + (y >> 1) * 0x297a2d39u + (z >> 1) * 0x9c8f2d35u
                                     + place.level * 0x68e31da5u + q->extra * 0xb5297a4du + side * 0x1b56c4e9u);
     CellKey key;
