@@ -1,6 +1,7 @@
 """Photons that go on, against a tracer in NumPy; the virtual lights that they leave."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ def room(walls=WALLS, door=False):
     """Return a box with a lamp under its ceiling and a block on its floor; open or closed."""
     box = inside_out(primitives.box())
     if door:
-        box = type(box)(box.positions, box.triangles[2:])
+        box = replace(box, triangles=box.triangles[2:])
     lamp = transform.translation((0.1, 0.45, 0.0)) @ transform.scaling(0.1)
     block = transform.translation((-0.2, -0.35, 0.1)) @ transform.scaling(0.3)
     parts = [
