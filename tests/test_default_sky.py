@@ -6,10 +6,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scene_builder import build, camera, floor, glowing, grey, lambertian
+from scene_builder import build, camera, floor, glowing, grey, lambertian, render
 
 from psf_cl.scene import primitives, transform
-from psf_cl.scene.default_sky import DEFAULT_SKY, LIT, glow_share, with_default_sky
+from psf_cl.scene.default_sky import LIT, SKY_TOWARD, glow_share, with_default_sky
 from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Light, Texture
 
@@ -91,7 +91,7 @@ def test_a_room_that_its_lamp_lights_stays_dark_outside():
 
 def test_a_model_with_a_lamp_that_lights_nothing_gets_a_sky():
     scene = with_default_sky(build([box(1.0, glowing(50.0))], FRONT), opened=True)
-    assert scene.environment.radiance == DEFAULT_SKY
+    assert scene.environment.image is not None
     assert any("(0 % of" in note for note in scene.notes)
 
 
@@ -107,8 +107,22 @@ def test_a_lamp_without_extent_is_light():
 
 def test_no_sky_is_added_where_none_is_asked_for(tmp_path):
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    assert load_scene(tmp_path / "a.obj").environment.radiance == DEFAULT_SKY
-    assert load_scene(tmp_path / "a.obj", environment="none").environment.radiance == (0, 0, 0)
+    assert load_scene(tmp_path / "a.obj").environment.image is not None
+    dark = load_scene(tmp_path / "a.obj", environment="none").environment
+    assert dark.radiance == (0, 0, 0) and dark.image is None
     text = '[environment]\nradiance = [1, 2, 3]\n[[shapes]]\nprimitive = "quad"\n'
     (tmp_path / "a.toml").write_text(text)
     assert load_scene(tmp_path / "a.toml", environment="none").environment.radiance == (0, 0, 0)
+
+
+@pytest.mark.parametrize("normal", [(0, 1, 0), (0, -1, 0), (1, 0, 0), (0, 0, 1), (-0.6, 0, -0.8)])
+def test_white_matt_surfaces_show_which_way_they_face(device, normal):
+    normal = np.array(normal, float)
+    # The quad lies in y = 0 and faces up: it is seen from above wherever it is turned to.
+    turned = transform.look_at((0, 0, 0), tuple(-normal), tuple(np.roll(normal, 1)))
+    turned = turned @ transform.rotation_xyz_degrees((90.0, 0.0, 0.0))
+    view = camera(tuple(3 * normal), (0, 0, 0), 10.0, up=tuple(np.roll(normal, 1)))
+    scene = build([(primitives.quad(), turned, lambertian(1.0))], view, (16, 16))
+    image = render(device, with_default_sky(scene, opened=True), 64)
+    shown = 0.6 + 0.4 * (2.0 / 3.0) * normal @ SKY_TOWARD
+    assert image.rgb.mean() == pytest.approx(shown, abs=0.004)

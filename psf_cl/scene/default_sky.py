@@ -25,10 +25,18 @@ from psf_cl.scene.model import (
 from psf_cl.scene.texture import mean_color
 from psf_cl.scene.transform import transform_points
 
-DEFAULT_SKY = (1.0, 1.0, 1.0)
+#: Radiance of the default sky: in its middle, and what a unit toward ``SKY_TOWARD`` adds.  White
+#: surfaces stand out before it, and sides that face elsewhere are told apart: a matt surface of
+#: reflectance 1 shows 0.6 + 0.4 (2 / 3) dot(n, SKY_TOWARD) where nothing is in the way.
+SKY_MIDDLE, SKY_SLOPE = 0.6, 0.4
 
-#: Light by what glows, over that by the default sky, from which on a scene counts as lit.  Rooms
-#: with lamps have 0.05 and more, models with lamps or labels on them 0.02 and less.
+#: Up, and to the left and front of who looks along -Z; unit length.
+SKY_TOWARD = (-0.48, 0.768, 0.424)
+
+_SKY_ROWS = 128
+
+#: Light by what glows, over that by a sky of radiance 1, from which on a scene counts as lit.
+#: Rooms with lamps have 0.05 and more, models with lamps or labels on them 0.02 and less.
 LIT = 0.03
 
 _RAYS = 128
@@ -38,7 +46,7 @@ _CHUNK = 1 << 12
 
 
 def with_default_sky(scene: Scene, opened: bool) -> Scene:
-    """Return the scene with a sky of radiance 1 if it has no light, and a note that says so.
+    """Return the scene with a sky if it has no light, and a note that says so.
 
     Args:
         opened: whether it is a model file and no ``.toml``, whose author says what light there is:
@@ -53,12 +61,28 @@ def with_default_sky(scene: Scene, opened: bool) -> Scene:
         why = (
             f"the scene is hardly lit by what glows ({100 * share:.2g} % of what a sky would bring)"
         )
-    note = f"{why}: a sky of constant radiance (1, 1, 1) is added (none with --environment none)"
-    return replace(scene, environment=Environment(DEFAULT_SKY), notes=(*scene.notes, note))
+    low, high = SKY_MIDDLE - SKY_SLOPE, SKY_MIDDLE + SKY_SLOPE
+    note = (
+        f"{why}: a sky of radiance {low:.1f} to {high:.1f} is added (none with --environment none)"
+    )
+    return replace(scene, environment=default_sky(), notes=(*scene.notes, note))
+
+
+def default_sky() -> Environment:
+    """Return a white sky that is brightest toward ``SKY_TOWARD`` and darkest on the other side."""
+    v, u = np.mgrid[:_SKY_ROWS, : 2 * _SKY_ROWS] + 0.5
+    polar, azimuth = v * np.pi / _SKY_ROWS, u * np.pi / _SKY_ROWS
+    across = np.sin(polar)
+    direction = np.stack(
+        [across * np.sin(azimuth), np.cos(polar), -across * np.cos(azimuth)], axis=-1
+    )
+    radiance = SKY_MIDDLE + SKY_SLOPE * (direction @ SKY_TOWARD)
+    image = np.repeat(radiance[..., None], 3, axis=-1).astype(np.float32)
+    return Environment((1.0, 1.0, 1.0), image)
 
 
 def glow_share(scene: Scene) -> float:
-    """Return how much light what glows brings to the surfaces, over that of the default sky.
+    """Return how much light what glows brings to the surfaces, over that of a sky of radiance 1.
 
     That is pi B r A' / (pi A): B the mean radiance of what glows, A' its area (both sides, if both
     glow), A the area of all surfaces, r the share of its rays that come to a surface which is no
