@@ -25,7 +25,7 @@ static inline void count_photons(volatile __global uint *photon_counters, uint w
 
 /// Let every photon that hit something leave a virtual light there, and send it on or end it.
 ///
-/// With `bounces` surfaces behind it at most; `shading` as in shade.cl, without normal maps.
+/// With `most_bounces` surfaces behind it at most.  Surfaces are without their normal maps.
 ///
 /// reads   photons, scene tables
 /// writes  photons; virtual_keys, virtual_counts, photon_counters (atomic)
@@ -40,7 +40,7 @@ kernel void scatter_photons(
     __global const Material *materials TEXTURE_PARAMETERS COLOR_PARAMETERS INSTANCE_PARAMETERS,
     volatile __global uint *virtual_keys,
     volatile __global uint *virtual_counts,
-    const uint bounces)
+    const uint most_bounces)
 {
     const uint item = get_global_id(0);
     if (item >= params->slots / W)
@@ -132,7 +132,7 @@ kernel void scatter_photons(
     const Float chance = min(max3(f), (Float)(MAX_SURVIVAL));
     const Mask survives =
         hit & !broken & (pdf > 0.0f) & (carried > 0.0f) & (left_of_choice(chances, u_lobe) < chance);
-    const Mask goes_on = survives & (bounce < bounces);
+    const Mask goes_on = survives & (bounce < most_bounces);
     count_photons(photon_counters, PHOTONS_REJECTED, broken);
     count_photons(photon_counters, PHOTONS_ABSORBED, hit & !broken & !survives);
     count_photons(photon_counters, PHOTONS_CUT, survives & !goes_on);

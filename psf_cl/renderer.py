@@ -255,7 +255,7 @@ class Renderer:
                 self.photon_map.clear()
             passes = len(self._epoch(start))
             count = photons.photons_for(self.settings, passes, self.plan.pixel_count)
-            self.photon_map.add(count)
+            self.photon_map.add(count, self.scheduler.first)
 
     def _epoch_end(self, passes: int) -> int:
         """Return the pass of a frame before which the epoch ends that starts with ``passes``."""

@@ -105,10 +105,10 @@ class Settings:
         "paths",
         "virtual_lights",
         doc="light reflected more than once by paths, or by photons that stand for it, to compare: "
-        "biased, for they are dimmed where they are near",
+        "biased, for they are dimmed where they are near, and lie on matt surfaces alone",
     )
     virtual_clearance: float = _number(
-        0.05, 0.0, 1.0, doc="how near that is, radii of the scene; 0 for no bias, and bright dots"
+        0.05, 0.0, 1.0, doc="how near that is, radii of the scene; 0 for bright dots"
     )
     direct_sampling: str = _choice(
         "mis", "light", "bsdf", doc="direct light by both strategies, or by one of them alone"

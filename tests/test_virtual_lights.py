@@ -239,3 +239,20 @@ def test_virtual_lights_are_planned_where_light_is_reflected_twice():
     assert stages(indirect_light="virtual_lights", max_depth=1) == (set(), False)
     # Direct photons alone choose lights: they end where they are stored.
     assert stages(light_sampling="photon") == ({"photons"}, True)
+
+
+def test_lengths_of_paths_can_be_looked_at_too(device):
+    image = render(device, room(), 1, ("bounces",), **VIRTUAL)
+    assert np.isfinite(image.rgb).all() and (image.aovs["bounces"] >= 0.0).all()
+
+
+def test_frames_have_photons_of_their_own(device):
+    opened = open_renderer(device, room(), **VIRTUAL)
+    keys = []
+    for _ in range(2):
+        opened.render(spp=1)
+        keys.append(opened.device.read(opened.buffers["virtual_keys"]))
+        opened.set_frame(0.0)
+    opened.close()
+    known = (keys[0] != 0xFFFFFFFF) & (keys[1] != 0xFFFFFFFF)
+    assert known.sum() > 100 and not (keys[0] == keys[1])[known].any()

@@ -33,9 +33,8 @@ static inline Float change_in_cell(
 
 #if CELL_HISTORY
 #define KNOWN_BUFFERS                                                                              \
-    , __global const uint *kept_keys, __global const uint *kept_full,                              \
-        __global const CellHistory *kept_cells CHANGE_BUFFER
-#define KNOWN_ARGUMENTS , kept_keys, kept_full, kept_cells CHANGE_ARGUMENT
+    , __global const uint *kept_keys, __global const CellHistory *kept_cells CHANGE_BUFFER
+#define KNOWN_ARGUMENTS , kept_keys, kept_cells CHANGE_ARGUMENT
 
 // Frames from which on a cell knows enough not to ask those of other levels.
 #define ENOUGH_FRAMES 8.0f
@@ -63,7 +62,8 @@ static inline void take_known(
 {
     const CellKey key = cell_key(params, query, place, wall);
     const uint size = bucket_size(params->cell_slots);
-    const UInt slot = find_lanes(kept_keys, kept_full, mask, key.bucket, size, key.key);
+    // Also in buckets that a pass of this frame has filled: whether one has depends on which passes are done.
+    const UInt slot = find_keys(kept_keys, mask, key.bucket, size, key.key);
     const Mask found = mask & (slot != NO_SLOT);
     if (!any_lane(found))
         return;

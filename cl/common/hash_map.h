@@ -81,19 +81,16 @@ static inline uint find(const __global uint *keys, uint bucket, uint size, uint 
     return NO_SLOT;
 }
 
-/// Slots of the keys of the lanes in `mask`, NO_SLOT of those that are not there or in a full bucket.
+/// Slots of the keys of the lanes in `mask`, NO_SLOT of those that are not there.
 ///
 /// Nearly all keys are in the slot where probing starts: all lanes look there at once.
-static inline UInt find_lanes(
-    const __global uint *keys, const __global uint *full_buckets, Mask mask, UInt bucket, uint size, UInt key)
+static inline UInt find_keys(const __global uint *keys, Mask mask, UInt bucket, uint size, UInt key)
 {
-    const uint shift = popcount(size - 1u);
-    const Mask usable = mask & (look_lanes(full_buckets, bucket >> shift) == 0u);
     const UInt start = bucket + (key & (size - 1u));
     const UInt first = look_lanes(keys, start);
-    const Mask there = usable & (first == key);
+    const Mask there = mask & (first == key);
     UInt slot = pick_u(there, start, (UInt)(NO_SLOT));
-    const Mask further = usable & !there & (first != 0u);
+    const Mask further = mask & !there & (first != 0u);
     if (any_lane(further)) {
         uint lane_bucket[W];
         uint lane_key[W];
@@ -108,6 +105,15 @@ static inline UInt find_lanes(
         slot = load_lanes_u(lane_slot);
     }
     return slot;
+}
+
+/// The same, and NO_SLOT of those in a full bucket.
+static inline UInt find_lanes(
+    const __global uint *keys, const __global uint *full_buckets, Mask mask, UInt bucket, uint size, UInt key)
+{
+    const uint shift = popcount(size - 1u);
+    const Mask usable = mask & (look_lanes(full_buckets, bucket >> shift) == 0u);
+    return find_keys(keys, usable, bucket, size, key);
 }
 
 /// Slots of the keys of the lanes in `wanted`; those of `making` are claimed where they were not there.

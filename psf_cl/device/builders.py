@@ -67,20 +67,20 @@ def build_programs(device: Device, wanted: Sequence[Wanted]) -> list[Program]:
         DeviceError: a program does not build.
     """
     waiting = deque(wanted)
-    helpers: list[threading.Thread] = []
-    with contextlib.ExitStack() as stack:
+    helpers: list[_Helper] = []
+    try:
         while waiting:
             is_cold = _build(device, waiting.popleft())
             if is_cold and not helpers:
-                for _ in range(min(device.builders, len(waiting))):
-                    process = stack.enter_context(_builder(device))
-                    helper = threading.Thread(
-                        target=_keep_busy, args=(process, waiting), daemon=True
-                    )
-                    helper.start()
-                    helpers.append(helper)
+                # One after the other, for systems that have no room for more.
+                with contextlib.suppress(OSError):
+                    for _ in range(min(device.builders, len(waiting))):
+                        helpers.append(_Helper(device, waiting))
         for helper in helpers:
-            helper.join()
+            helper.thread.join()
+    finally:
+        for helper in helpers:
+            helper.end()
     for each in wanted:
         _build(device, each)
     return [load_program(device, each.file, each.defines) for each in wanted]
@@ -96,28 +96,32 @@ def _build(device: Device, wanted: Wanted) -> bool:
     return program.seconds - before > _COLD_RATIO * before
 
 
-@contextlib.contextmanager
-def _builder(device: Device):
-    """Start a process that builds for ``device``; it is gone at the end."""
-    package = str(Path(__file__).resolve().parents[2])
-    paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "psf_cl.device.builders"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
-        # Ctrl-C is for this process.
-        start_new_session=True,
-    )
-    try:
-        traits = dataclasses.asdict(device.traits)
-        _send(process, {"device": device.name, "traits": traits})
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
+class _Helper:
+    """A process that builds for ``device`` what a thread takes off the end of ``waiting``."""
+
+    def __init__(self, device: Device, waiting: deque[Wanted]) -> None:
+        package = str(Path(__file__).resolve().parents[2])
+        paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
+        self.process = subprocess.Popen(
+            # -P: what lies in the current folder is not meant.
+            [sys.executable, "-P", "-m", "psf_cl.device.builders"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+            # Ctrl-C is for this process.
+            start_new_session=True,
+        )
+        _send(self.process, {"device": device.name, "traits": dataclasses.asdict(device.traits)})
+        self.thread = threading.Thread(target=_keep_busy, args=(self.process, waiting), daemon=True)
+        self.thread.start()
+
+    def end(self) -> None:
+        """End the process, whatever it is at, then the thread, which waits for its answers."""
+        self.process.kill()
+        self.thread.join()
+        self.process.communicate()
 
 
 def _send(process: subprocess.Popen[str], message: dict[str, object]) -> None:

@@ -17,6 +17,12 @@ if TYPE_CHECKING:
     from psf_cl.stages.virtual_lights import VirtualLights
     from psf_cl.traits import DeviceTraits
 
+#: Photons that a frame draws at most.
+MOST_DRAWN = (1 << 32) - 1
+
+# Odd, so that all frames begin elsewhere; 2^32 over the golden ratio, so that they do far apart.
+_FRAME_STEP = 0x9E3779B1
+
 #: Photons of an epoch if it is not said how many: as many as a share of its camera paths.
 SHARE_OF_PATHS = 0.25
 FEWEST, MOST = 1 << 14, 1 << 20
@@ -157,9 +163,15 @@ class PhotonMap:
             self.virtual_lights.clear()
         self.device.fill(self.buffers["photon_counters"])
 
-    def add(self, count: int) -> None:
-        """Emit ``count`` photons and enqueue that the map and its table keep them."""
-        first, items = self.drawn(), -(-self.traits.slots // self.traits.lanes)
+    def add(self, count: int, first_pass: int) -> None:
+        """Emit ``count`` photons and enqueue that the map and its table keep them.
+
+        Those of a frame, which begins with ``first_pass``, are others than those of the frames
+        before.  Counters have 32 bits: what would go beyond is not emitted.
+        """
+        drawn, items = self.drawn(), -(-self.traits.slots // self.traits.lanes)
+        count = min(count, MOST_DRAWN - drawn)
+        first = first_pass * _FRAME_STEP + drawn
         for start in range(0, count, self.traits.slots):
             batch = min(count - start, self.traits.slots)
             # Numbers of 32 bits: they begin again.

@@ -85,7 +85,7 @@ class VirtualLights:
         self.device, self.buffers = device, buffers
         self.surfaces = surfaces_for(settings)
         self.scatter = program.bind_planned(
-            "scatter_photons", buffers, bounces=max(self.surfaces - 1, 0)
+            "scatter_photons", buffers, most_bounces=max(self.surfaces - 1, 0)
         )
         self.settle = program.bind_planned("settle_virtual_lights", buffers)
 
