@@ -74,7 +74,8 @@ def read_learned(
     """Read what another render learned, and return it with a digest of it.
 
     Raises:
-        InputError: no such file, a damaged one, or one of another scene, size or settings.
+        InputError: no such file, a damaged one, or one that belongs to something else than
+            ``identity``.
     """
     _, tables = read_state(path, _KIND, identity, buffers)
     for name, table in tables.items():

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -717,7 +717,7 @@ class Renderer:
 
         Raises:
             InputError: nothing is learned; or the file is missing, damaged, or of another scene,
-                size or settings.
+                picture size, version, or settings of what learns.
         """
         names = learned.table_names(self.settings, str(path))
         buffers = {name: (self.buffers[name].dtype, self.buffers[name].count) for name in names}
@@ -726,15 +726,11 @@ class Renderer:
             self.device.write(self.buffers[name], table)
 
     def _learned_identity(self) -> dict[str, Any]:
-        """Return what tables of this render belong to: the scene, but not the camera in it."""
+        """Return what tables of this render belong to: the scene, but not the cameras in it."""
         return {
             "version": f"{__version__} {source_digest()}",
-            "scene": {
-                "center": [float(x) for x in self.center],
-                "radius": float(self.radius),
-                "triangles": len(self.cut_out),
-                "brightest": cells.brightest(self.moving),
-            },
+            "scene": self._digest_but_cameras,
+            "picture": {"size": [self.scene.width, self.scene.height]},
             "settings": {name: getattr(self.settings, name) for name in learned.SETTINGS},
             "tables": {
                 f"{name}_slots": self.buffers[f"{name}_keys"].count
@@ -742,6 +738,15 @@ class Renderer:
                 if f"{name}_keys" in self.buffers
             },
         }
+
+    @cached_property
+    def _digest_but_cameras(self) -> str:
+        """Return a digest of the scene at all times, from wherever it is seen."""
+        scene = replace(self.moving, width=0, height=0, cameras=(), camera=0)
+        if not (motion.moving_shapes(scene) or self.lights_change):
+            # What only cameras move with is no part of it.
+            scene = animation.baked(scene, None)
+        return scene_digest(scene)
 
     @cached_property
     def identity(self) -> dict[str, Any]:

@@ -18,6 +18,12 @@ from psf_cl.files import write_parts
 _LENGTH = struct.Struct("<Q")
 _DIGEST_BYTES = 32
 
+#: What to do without a file, by its kind.
+_WAYS = {
+    "checkpoint": "an older one, or a render from the start, is the way",
+    "cache": "render without --load-cache, which learns anew",
+}
+
 #: Bytes of the description at most: a damaged length must not ask for memory.
 _MAX_HEADER_BYTES = 1 << 20
 
@@ -31,7 +37,7 @@ def write_state(
     """Write arrays, whole or not at all: whoever looks sees the old file or the new one.
 
     Args:
-        kind: what the file is, a word.
+        kind: what the file is, ``"checkpoint"`` or ``"cache"``.
         header: plain JSON values, among them ``"identity"``: what the arrays belong to.
         buffers: name to array, 1-D.
 
@@ -85,8 +91,7 @@ def read_state(
 
 def damaged(path: str | os.PathLike[str], kind: str) -> InputError:
     """Return the error of a file that is not what was written."""
-    way = "an older one, or a render from the start, is the way"
-    return InputError(f"{path}: damaged or truncated {kind}; {way}")
+    return InputError(f"{path}: damaged or truncated {kind}; {_WAYS[kind]}")
 
 
 def _magic(kind: str) -> bytes:

@@ -3,39 +3,36 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene_builder import build, camera, floor, glowing, lambertian, luminance_blocks, renderer
+from scene_builder import camera, luminance_blocks, renderer
+from test_guide import room
 
 from psf_cl.cli.main import main
 from psf_cl.device import layout
 from psf_cl.device.device import Device
 from psf_cl.errors import InputError
 from psf_cl.learned import MOST_VISITS, fade, table_names
-from psf_cl.scene import primitives, transform
+from psf_cl.scene.curve import Curve
+from psf_cl.scene.model import Node
 from psf_cl.settings import Settings
 
 BOTH = {"guiding": "learned", "termination": "cache"}
-EYE, OTHER_EYE = (0, 1.5, 3), (0.6, 1.2, 2.8)
+OTHER_EYE = (0.6, 1.2, 2.8)
 
 
-def room(eye=EYE, size=(24, 16), light=40.0):
-    """Return a lamp behind a wall that lights a floor around the corner."""
-    wall = transform.translation((0, 0.6, 0)) @ transform.rotation_xyz_degrees((90, 0, 0))
-    lamp = transform.translation((0, 1.4, -1.5)) @ transform.rotation_xyz_degrees((180, 0, 0))
-    back = transform.translation((0, 1.5, -2.5)) @ transform.rotation_xyz_degrees((90, 0, 0))
-    return build(
-        [
-            floor(3.0, lambertian((0.7, 0.5, 0.3))),
-            (primitives.quad(), wall @ transform.scaling(1.2), lambertian((0.3, 0.6, 0.8))),
-            (primitives.quad(), back @ transform.scaling(3.0), lambertian((0.8, 0.8, 0.8))),
-            (primitives.quad(), lamp @ transform.scaling(0.2), glowing((light, 30.0, 20.0))),
-        ],
-        camera(eye, (0, 0.5, 0), 45),
-        size,
-    )
+def seen_from(eye):
+    return replace(room(), cameras=(camera(eye, (0, 0.5, 0), 45),))
+
+
+def painted(index, **values):
+    """Return the room with another material."""
+    materials = list(room().materials)
+    materials[index] = replace(materials[index], **values)
+    return replace(room(), materials=tuple(materials))
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +45,7 @@ def small(device):
 def saved(small, tmp_path_factory):
     """Return the file of a render from another place."""
     path = tmp_path_factory.mktemp("saved") / "room.cache"
-    with contextlib.closing(renderer(small, room(OTHER_EYE), **BOTH)) as first:
+    with contextlib.closing(renderer(small, seen_from(OTHER_EYE), **BOTH)) as first:
         first.render(spp=128)
         first.save_cache(path)
     return path
@@ -76,6 +73,20 @@ def test_a_render_begins_with_what_another_one_knows(small, saved):
     assert ended[1] > ended[0] + 0.2
     variance = [luminance_blocks(image, 1)[1].item() for image in images]
     assert variance[1] < 0.8 * variance[0]
+
+
+def test_cameras_and_the_time_of_a_frame_do_not_make_another_scene(small, saved):
+    rise = Curve(np.array([0.0, 1.0]), np.array([[0.0, 1.5, 3.0], [0.0, 1.6, 2.0]]))
+    view = room().cameras[0]
+    flight = replace(
+        room(),
+        nodes=(Node(curves={"translation": rise}),),
+        cameras=(view, replace(view, node=0)),
+        camera=1,
+    )
+    with contextlib.closing(begun(small, saved, flight)) as opened:
+        opened.set_frame(0.5)
+        opened.load_cache(saved)
 
 
 def test_what_is_loaded_is_what_was_saved(small, saved, tmp_path):
@@ -112,9 +123,10 @@ def test_bits_with_a_loaded_cache_do_not_depend_on_the_pool_or_a_stop(
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"scene": room(light=41.0)}, "brightest=40.0; this one has 41.0"),
+        ({"scene": painted(0, base_color=(0.7, 0.5, 0.2))}, "is of another scene"),
+        ({"scene": painted(3, emission=(41.0, 30.0, 20.0))}, "is of another scene"),
         ({"max_depth": 3}, "max_depth=16; this one has 3"),
-        ({"scene": room(size=(1024, 512))}, "guide_slots=16384; this one has 32768"),
+        ({"scene": room(size=(16, 24))}, r"size=\[24, 16\]; this one has \[16, 24\]"),
         ({"guide_cell_size": 16.0}, "guide_cell_size=32.0; this one has 16.0"),
     ],
 )
@@ -147,7 +159,7 @@ def test_sums_that_are_about_to_run_over_are_refused(small, saved, tmp_path):
         sums["high"][3, 4] = 1 << 31
         opened.device.write(opened.buffers["guide_sums"], sums)
         opened.save_cache(tmp_path / "huge.cache")
-        with pytest.raises(InputError, match="damaged or truncated cache"):
+        with pytest.raises(InputError, match="truncated cache; render without --load-cache"):
             opened.load_cache(tmp_path / "huge.cache")
 
 
@@ -193,6 +205,21 @@ specular = 0.0
 primitive = "sphere"
 material = "grey"
 """
+
+
+def test_statistics_are_written_before_a_cache_that_finds_no_room(
+    device, tmp_path, monkeypatch, capsys
+):
+    def full(path, *_):
+        raise InputError(f"{path}: no space left")
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.toml").write_text(SCENE)
+    monkeypatch.setattr("psf_cl.learned.write_learned", full)
+    run = "render a.toml --preset learned --spp 1 --quiet -o a.exr --stats s.json --save-cache c"
+    assert main(run.split()) == 2
+    assert capsys.readouterr().err.strip().endswith("c: no space left")
+    assert json.loads((tmp_path / "s.json").read_text())["spp"] == 1
 
 
 def test_a_fly_through_saves_and_loads_on_the_command_line(device, tmp_path, monkeypatch, capsys):

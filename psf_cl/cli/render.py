@@ -200,12 +200,13 @@ def run(args: argparse.Namespace) -> int:
                 print(_summary(exr, image))
             if interrupted():
                 break
-        if args.save_cache:
-            renderer.save_cache(args.save_cache)
         if args.stats:
             stats = {"frames": all_stats} if args.frames else all_stats[0]
             stats["process_seconds"] = time.perf_counter() - START
             write_whole(args.stats, (json_text(stats, indent=2) + "\n").encode())
+        if args.save_cache:
+            # The largest file: if it finds no room, all else is written.
+            renderer.save_cache(args.save_cache)
         stopped = interrupted()
     if checkpoints.failure is not None:
         raise checkpoints.failure
