@@ -479,7 +479,7 @@ def _few_corners(scene: Scene, triangles: int, traits: DeviceTraits) -> int:
     """Return how many distinct corners a small scene has, 0 for one that is too large to ask."""
     if triangles > traits.few_triangles:
         return 0
-    positions, labels = flatten(scene).positions, corner_labels(scene)
+    positions, labels = flatten(scene, densities=False).positions, corner_labels(scene)
     return len(few_triangles(positions, labels=labels).corners)
 
 

@@ -994,7 +994,11 @@ class Renderer:
     def _upload_scene(self) -> tables.Geometry:
         scene, planned = self.scene, {spec.name for spec in self.plan.scene_buffers}
         self.placed = place(scene, self.plan.levels) if self.plan.levels is not None else None
-        geometry = tables.flatten(scene) if self.placed is None else self.placed.geometry
+        if self.placed is not None:
+            geometry = self.placed.geometry
+        else:
+            leveled = self.plan.features["TEXTURE_LEVELS"].value > 0
+            geometry = tables.flatten(scene, densities=leveled)
         self.lights = lights = tables.light_table(
             scene,
             geometry,

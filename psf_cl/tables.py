@@ -88,8 +88,12 @@ def visible_shapes(scene: Scene) -> list[Shape]:
     return [shape for shape in scene.shapes if not is_invisible(scene.materials[shape.material])]
 
 
-def flatten(scene: Scene) -> Geometry:
-    """Return the triangles of all visible shapes, in the order of the shapes."""
+def flatten(scene: Scene, densities: bool = True) -> Geometry:
+    """Return the triangles of all visible shapes, in the order of the shapes.
+
+    Args:
+        densities: whether levels of textures ask for ``density`` of the coordinates; else it is 0.
+    """
     positions, surfaces, normals, cut_out = [], [], [], []
     uvs: tuple[list[np.ndarray], ...] = ([], [])
     colors, tangents = [], []
@@ -127,7 +131,8 @@ def flatten(scene: Scene) -> Geometry:
         if mapped:
             for part, values in zip(uvs, (mesh.uvs, mesh.uvs1), strict=True):
                 record = _corner_records(layout.UVS, "uv", values, mesh, 0.0)
-                record["density"] = _density(record, surface)
+                if densities and values is not None:
+                    record["density"] = _density(record, surface)
                 part.append(record)
         if colored:
             colors.append(_corner_records(layout.VERTEX_COLORS, "c", mesh.colors, mesh, 1.0))
