@@ -198,11 +198,14 @@ def test_the_table_tells_good_from_bad(tool, device, monkeypatch, tmp_path, caps
 
 def test_jobs_of_the_simulator_are_renders_that_are_not_refused(tool):
     jobs = importlib.import_module("check_kernels")
+    planned = set()
     for name, job in jobs.JOBS.items():
         settings = resolve({}, name, job.preset, jobs.SMALL | dict(job.settings))
         outputs = (jobs.OUTPUTS if job.everything else ()) + job.outputs
         plan = make_plan(job.scene(jobs.EDGE), settings, outputs, halves=job.everything)
         assert plan.stages
+        planned |= {kernel.name for stage in plan.stages for kernel in stage.kernels}
+    assert planned >= {"view_guide", "scatter_photons", "settle_virtual_lights"}
 
 
 @pytest.mark.slow

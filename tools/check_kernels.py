@@ -158,6 +158,21 @@ JOBS = {
     "outputs of cells": Job(room, "psf", {"cell_min_count": 4}, outputs=OUTPUTS_OF_CELLS),
     "screen filter": Job(room, "pt", {"screen_filter": "path_space"}, tree=False),
     "splits": Job(room, "pt", {"splits": 2, "sampler": "random", "direct_sampling": "bsdf"}),
+    "virtual lights": Job(
+        room, "pt", {"indirect_light": "virtual_lights", "light_sampling": "photon"}
+    ),
+    "views": Job(
+        everything,
+        "pt",
+        {
+            "guiding": "learned",
+            "light_sampling": "photon",
+            "shadow_rays": "auto",
+            "texture_level": "footprint",
+        },
+        tree=False,
+        outputs=("guide", "visits", "lights", "light_pmf", "bounces"),
+    ),
 }
 
 #: Tables that are large whatever the scene, made small: simulators are slow.
