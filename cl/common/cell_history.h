@@ -63,7 +63,7 @@ static inline void take_known(
     const CellKey key = cell_key(params, query, place, wall);
     const uint size = bucket_size(params->cell_slots);
     // Also in buckets that a pass of this frame has filled: whether one has depends on which passes are done.
-    const UInt slot = find_keys(kept_keys, mask, key.bucket, size, key.key);
+    const UInt slot = find_in_buckets(kept_keys, mask, key.bucket, size, key.key);
     const Mask found = mask & (slot != NO_SLOT);
     if (!any_lane(found))
         return;

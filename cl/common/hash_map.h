@@ -84,7 +84,7 @@ static inline uint find(const __global uint *keys, uint bucket, uint size, uint 
 /// Slots of the keys of the lanes in `mask`, NO_SLOT of those that are not there.
 ///
 /// Nearly all keys are in the slot where probing starts: all lanes look there at once.
-static inline UInt find_keys(const __global uint *keys, Mask mask, UInt bucket, uint size, UInt key)
+static inline UInt find_in_buckets(const __global uint *keys, Mask mask, UInt bucket, uint size, UInt key)
 {
     const UInt start = bucket + (key & (size - 1u));
     const UInt first = look_lanes(keys, start);
@@ -113,7 +113,7 @@ static inline UInt find_lanes(
 {
     const uint shift = popcount(size - 1u);
     const Mask usable = mask & (look_lanes(full_buckets, bucket >> shift) == 0u);
-    return find_keys(keys, usable, bucket, size, key);
+    return find_in_buckets(keys, usable, bucket, size, key);
 }
 
 /// Slots of the keys of the lanes in `wanted`; those of `making` are claimed where they were not there.
