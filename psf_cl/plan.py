@@ -11,6 +11,7 @@ import numpy as np
 
 from psf_cl.device import layout
 from psf_cl.errors import DeviceError, InputError
+from psf_cl.few import few_triangles
 from psf_cl.image import AOVS
 from psf_cl.instancing import Levels, split
 from psf_cl.measure.timing import Declared
@@ -55,7 +56,6 @@ from psf_cl.stages.spec import BufferSpec, Context, Feature, StageSpec
 from psf_cl.tables import (
     count_rectangles,
     count_texels,
-    few_triangles,
     flatten,
     leveled_textures,
     light_spread,
@@ -954,6 +954,7 @@ def _scene_buffers(context: Context, scene: Scene) -> tuple[BufferSpec, ...]:
         buffers += [
             BufferSpec("corners", float32, 3 * context.corner_count, "corners of all triangles"),
             BufferSpec("faces", np.dtype(np.uint32), 4 * triangles, "triangles between them"),
+            BufferSpec("plates", layout.PLATE.dtype, triangles, "these by flat pieces"),
         ]
     else:
         buffers += _tree(triangles)

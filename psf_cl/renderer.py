@@ -30,6 +30,7 @@ from psf_cl.device.program import Launch, Program
 from psf_cl.device.sources import source_digest
 from psf_cl.device.two_levels import build_two_levels
 from psf_cl.errors import DeviceError, InputError, NoRoomError
+from psf_cl.few import NO_PLATES, Few, Plates, few_triangles, flat_pieces
 from psf_cl.image import Image
 from psf_cl.instancing import Placed, place
 from psf_cl.measure.errors import error_of_halves
@@ -39,7 +40,7 @@ from psf_cl.scene import animation
 from psf_cl.scene.digest import scene_digest
 from psf_cl.scene.far import far_from_origin, moved
 from psf_cl.scene.load import load_scene
-from psf_cl.scene.model import Scene
+from psf_cl.scene.model import Scene, hides_back
 from psf_cl.scheduler import MAX_PASSES, Hooks, Progress, Scheduler, doubling_epoch, longest_epoch
 from psf_cl.settings import Settings, resolve
 from psf_cl.stages import (
@@ -1010,17 +1011,19 @@ class Renderer:
             geometry.count,
             tables.leveled_textures(scene) if self.plan.features["TEXTURE_LEVELS"].value else (),
         )
-        few = None
+        few, plates = None, NO_PLATES
         if self.plan.features["FEW"].value:
             labels = motion.corner_labels(self.moving)
-            few = tables.few_triangles(geometry.positions, geometry.cut_out, labels)
+            few = few_triangles(geometry.positions, geometry.cut_out, labels)
+            hiding = np.array([hides_back(material) for material in scene.materials], bool)
+            plates = flat_pieces(few, geometry.cut_out | hiding[geometry.surfaces["material"]])
         self.dropped_triangles = few.dropped if few else 0
         self.few = few
         self.surfaces = geometry.surfaces
         if self.placed is not None:
             self.surfaces = self.surfaces[: self.placed.starts[1]]
         self.off_surfaces: tuple[np.ndarray, np.ndarray] | None = None
-        self.params = self._params(geometry, few, lights)
+        self.params = self._params(geometry, few, plates, lights)
         self.center, self.radius = geometry.center, geometry.radius
         self.cut_out = geometry.cut_out
         self.lights_change = motion.lights_change(self.moving)
@@ -1032,6 +1035,7 @@ class Renderer:
             "params": lambda: self.params,
             "corners": lambda: few.corners.reshape(-1),
             "faces": lambda: few.faces.reshape(-1),
+            "plates": lambda: plates.padded(geometry.count),
             "surfaces": lambda: geometry.surfaces,
             "materials": lambda: tables.material_table(scene.materials),
             "normals": lambda: or_zeros(geometry.normals, layout.NORMALS),
@@ -1069,7 +1073,8 @@ class Renderer:
     def _params(
         self,
         geometry: tables.Geometry,
-        few: tables.Few | None,
+        few: Few | None,
+        plates: Plates,
         lights: np.ndarray,
     ) -> np.ndarray:
         scene, settings = self.scene, self.settings
@@ -1097,6 +1102,8 @@ class Renderer:
             "environment_light": tables.environment_light(lights),
             "corner_count": len(few.corners) if few else 0,
             "face_count": len(few.faces) if few else 0,
+            "plate_count": len(plates.records),
+            "pair_count": plates.pairs,
             "environment_width": 1 if image is None else image.shape[1],
             "environment_height": 1 if image is None else image.shape[0],
             "environment_radiance": scene.environment.radiance,
@@ -1122,7 +1129,7 @@ class Renderer:
             params[0][name] = value
         return params
 
-    def _set_moving(self, geometry: tables.Geometry, few: tables.Few | None) -> None:
+    def _set_moving(self, geometry: tables.Geometry, few: Few | None) -> None:
         """Put what moves where it is in the first frame."""
         if "positions" in self.buffers:
             self.device.write(self.buffers["positions"], geometry.positions.reshape(-1))

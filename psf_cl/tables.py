@@ -280,49 +280,6 @@ def _world_normals(normals: np.ndarray, linear: np.ndarray) -> np.ndarray:
     return unit.astype(np.float32)
 
 
-@dataclass(frozen=True)
-class Few:
-    """All triangles of a small scene as a list.
-
-    Attributes:
-        corners: ``(n, 3)`` float32, no two equal; world, m.
-        faces: ``(m, 4)`` uint32, three corners and the triangle's index (with ALPHA_BIT).
-        dropped: triangles left out because a coordinate is not finite.
-        vertices: ``(n,)`` int64, the label of each corner that moves, -1 for the others.
-    """
-
-    corners: np.ndarray
-    faces: np.ndarray
-    dropped: int
-    vertices: np.ndarray
-
-
-def few_triangles(
-    positions: np.ndarray, cut_out: np.ndarray | None = None, labels: np.ndarray | None = None
-) -> Few:
-    """Return the triangles ``(n, 9)`` as indices into their distinct corners.
-
-    Args:
-        cut_out: ``(n,)`` bool, those whose alpha must be looked up; their index has ALPHA_BIT.
-        labels: ``(n, 3)`` int64, numbers from 0 of corners that move, the same for those that stay
-            together; -1 for the others.
-    """
-    finite = np.flatnonzero(np.isfinite(positions).all(axis=1))
-    # Adding 0 makes -0 the same corner as 0.
-    points = positions[finite].reshape(-1, 3) + np.float32(0.0)
-    label = np.full(len(points), -1) if labels is None else labels[finite].reshape(-1)
-    # Where corners are that move says nothing of which they are.
-    known = np.where(label[:, None] >= 0, 0.0, points.astype(np.float64))
-    _, first, index = np.unique(
-        np.column_stack([label, known]), axis=0, return_index=True, return_inverse=True
-    )
-    faces = np.concatenate([index.reshape(-1, 3), finite[:, None]], axis=1).astype(np.uint32)
-    if cut_out is not None:
-        faces[cut_out[finite], 3] |= np.uint32(layout.CONSTANT["ALPHA_BIT"])
-    dropped = len(positions) - len(finite)
-    return Few(points[first].astype(np.float32), faces, dropped, label[first])
-
-
 def material_table(materials: tuple[Material, ...]) -> np.ndarray:
     """Return ``(n,)`` layout.MATERIAL."""
     table = np.zeros(len(materials), layout.MATERIAL.dtype)

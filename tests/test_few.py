@@ -7,7 +7,7 @@ from rays import NO_HIT, all_hits, rays_at_edges
 from scene_builder import IDENTITY, build, camera, floor, glowing, lambertian, render
 from trimesh.creation import icosphere
 
-from psf_cl import tables
+from psf_cl import few, tables
 from psf_cl.device import layout
 from psf_cl.device.device import Device
 from psf_cl.plan import make_plan
@@ -28,15 +28,22 @@ class Listed:
     With ``cut_out``, ``(n,)`` bool, those triangles show CHECKS of their barycentrics (u, v).
     """
 
-    def __init__(self, device, triangles, cut_out=None):
+    def __init__(self, device, triangles, cut_out=None, flat=True):
         self.device = device
         self.triangles = np.ascontiguousarray(triangles, np.float32).reshape(-1, 3, 3)
-        self.few = tables.few_triangles(self.triangles.reshape(-1, 9), cut_out)
+        self.few = few.few_triangles(self.triangles.reshape(-1, 9), cut_out)
         assert len(self.few.corners) <= ROOM
         params = np.zeros(1, layout.PARAMS.dtype)
         params["corner_count"], params["face_count"] = len(self.few.corners), len(self.few.faces)
+        plates = few.NO_PLATES
+        if flat:
+            apart = np.zeros(len(self.triangles), bool) if cut_out is None else cut_out
+            plates = few.flat_pieces(self.few, apart)
+        params["plate_count"], params["pair_count"] = len(plates.records), plates.pairs
+        self.plates = plates
         contents = {
             "params": params,
+            "plates": plates.padded(len(plates.records) + 1),
             "corners": np.append(self.few.corners, np.float32(0)),
             "faces": np.append(self.few.faces, np.uint32(0)),
         }
@@ -89,8 +96,8 @@ class Listed:
 def listed(lane_device):
     made = []
 
-    def build(triangles, cut_out=None):
-        made.append(Listed(lane_device, triangles, cut_out))
+    def build(triangles, cut_out=None, flat=True):
+        made.append(Listed(lane_device, triangles, cut_out, flat))
         return made[-1]
 
     yield build
@@ -381,6 +388,68 @@ def test_rays_along_the_axes_do_not_slip_between_faces(listed):
         assert (found != NO_HIT).all()
         np.testing.assert_allclose(hits[:, 0], 3.0, rtol=1e-6)
         assert grid.any(rays * np.array([1, 1, 1, 4, 4, 4])).all()
+
+
+@pytest.mark.parametrize("offset", [0.0, 100.0])
+@pytest.mark.parametrize("mesh", CLOSED)
+def test_plates_find_what_going_by_corners_finds(listed, mesh, offset):
+    points, faces = CLOSED[mesh]
+    center = offset * np.array([1.0, -0.3, 0.7])
+    points = (center + points).astype(np.float32)
+    origins = (center + np.random.default_rng(5).uniform(-2, 2, (20_000, 3))).astype(np.float32)
+    rays = np.concatenate(
+        [rays_at_edges(points, faces, origins, 6)[:, :6], rays_around(20_000)]
+    ).astype(np.float32)
+    rays[20_000:, :3] += center.astype(np.float32)
+    flat, exact = listed(points[faces]), listed(points[faces], flat=False)
+    assert len(flat.plates.records) and not len(exact.plates.records)
+    (found, hits), (expected, known) = flat.closest(rays), exact.closest(rays)
+    # On a diagonal either half of a side is right.
+    side = found // 2 if mesh == "box" else found
+    np.testing.assert_array_equal(side, expected // 2 if mesh == "box" else expected)
+    same = (found == expected) & (found != NO_HIT)
+    assert same.mean() > 0.2
+    tolerance = 1e-4 if offset == 0.0 else 1e-2
+    # Rays within a hair of a plane round more.
+    assert (np.abs(hits[same] - known[same]).max(axis=1) > tolerance).mean() < 1e-3
+    # Rays to the mesh end right on it.
+    rays[:, 3:] *= np.float32(1.5)
+    np.testing.assert_array_equal(flat.any(rays), exact.any(rays))
+
+
+def test_sides_of_a_box_are_plates_and_other_triangles_stay_alone(listed):
+    points, faces = CLOSED["box"]
+    box = points[faces].astype(np.float32)
+    sides = listed(box).plates
+    assert (len(sides.records), sides.pairs) == (6, 6)
+    corner = (1 << layout.CONSTANT["PLATE_TURN"]) - 1
+    pairs = np.sort(np.stack([sides.records["first"], sides.records["second"]]) & corner, axis=0)
+    normals = np.cross(box[:, 1] - box[:, 0], box[:, 2] - box[:, 0])
+    np.testing.assert_allclose(normals[pairs[0]], normals[pairs[1]], atol=1e-6)
+    assert sorted(pairs.ravel()) == list(range(12))
+    # From the neighbourhood of the box rounding decides next to nothing.
+    assert (3.0 * sides.records["slack"] + sides.records["slack_here"] < 1e-4).all()
+    ball = listed(BALL.vertices[BALL.faces]).plates
+    assert (len(ball.records), ball.pairs) == (len(BALL.faces), 0)
+    # Nothing says which of two that lie in one place is hit, but their order.
+    assert listed(np.concatenate([box, box])).plates.pairs == 0
+    assert listed(box, np.arange(12) < 2).plates.pairs == 5
+
+
+def test_what_moves_or_has_no_plane_is_looked_at_corner_by_corner():
+    triangles = sharing_soup(8).reshape(-1, 9)
+    alone = np.zeros(9, bool)
+    still = few.few_triangles(triangles)
+    assert len(few.flat_pieces(still, alone).records) == 8
+    labels = np.full((8, 3), -1)
+    labels[0, 0] = 0
+    assert not len(few.flat_pieces(few.few_triangles(triangles, labels=labels), alone).records)
+    sliver = np.array([[0, 0, 0, 1, 0, 0, 0.5, 1e-30, 0]], np.float32)
+    thin = few.few_triangles(np.concatenate([triangles, sliver]))
+    assert not len(few.flat_pieces(thin, alone).records)
+    line = np.array([[0, 0, 0, 1, 0, 0, 2, 0, 0]], np.float32)
+    pieces = few.flat_pieces(few.few_triangles(np.concatenate([triangles, line])), alone)
+    assert len(pieces.records) == 9 and not pieces.records["n"][8].any()
 
 
 # Whole renders, with a list and with a tree.

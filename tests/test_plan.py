@@ -65,7 +65,7 @@ ALWAYS = {
     *("pool", "counters", "samples", "film"),
 }
 TREE = {"nodes", "blocks"}
-LIST = {"corners", "faces"}
+LIST = {"corners", "faces", "plates"}
 TEXTURE_BUFFERS = {"uvs", "textures", "texels", "srgb_to_linear"}
 NEEDED = {
     "TEXTURES": TEXTURE_BUFFERS,

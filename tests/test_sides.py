@@ -20,14 +20,14 @@ from scene_builder import (
     render,
 )
 
-from psf_cl import instancing, tables
+from psf_cl import few, instancing, tables
 from psf_cl.device import layout
 from psf_cl.device.bvh import build_bvh
 from psf_cl.device.device import Device
 from psf_cl.device.two_levels import build_two_levels
 from psf_cl.plan import make_plan
 from psf_cl.scene import primitives, transform
-from psf_cl.scene.model import Mesh
+from psf_cl.scene.model import Mesh, hides_back
 from psf_cl.settings import PRESETS, Settings
 
 MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
@@ -94,10 +94,14 @@ def scene_tables(device, scene, plan):
         "materials": tables.material_table(scene.materials),
     }
     if plan.features["FEW"].value:
-        few = tables.few_triangles(geometry.positions)
-        contents |= {"corners": few.corners, "faces": few.faces}
-        contents["params"]["corner_count"] = len(few.corners)
-        contents["params"]["face_count"] = len(few.faces)
+        listed = few.few_triangles(geometry.positions)
+        hides = np.array([hides_back(material) for material in scene.materials])
+        plates = few.flat_pieces(listed, hides[geometry.surfaces["material"]])
+        contents |= {"corners": listed.corners, "faces": listed.faces, "plates": plates.records}
+        contents["params"]["corner_count"] = len(listed.corners)
+        contents["params"]["face_count"] = len(listed.faces)
+        contents["params"]["plate_count"] = len(plates.records)
+        contents["params"]["pair_count"] = plates.pairs
         tree = None
     elif placed is None:
         positions = device.upload("positions", geometry.positions.reshape(-1))

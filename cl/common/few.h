@@ -1,4 +1,4 @@
-// Rays of all lanes against a few triangles: every triangle, no tree.
+// Rays of all lanes against a few triangles, corner by corner: slow, and exact at every edge.
 //
 // Corners are projected along each ray once, into a plane in which the ray is the origin; a triangle
 // is hit where its three edge functions agree in sign.  Triangles that share an edge see the same
@@ -134,7 +134,7 @@ static inline Edges edges_of(const SeenCorners *seen, uint a, uint b, uint c, Ma
 }
 
 /// First hits of the rays; of equally near triangles that of the lowest index.
-static inline Hits trace_closest_few(
+LARGE_FUNCTION Hits trace_closest_corners(
     __global const Params *params,
     Mask active,
     Vec3 origin,
@@ -191,7 +191,7 @@ static inline Hits trace_closest_few(
 }
 
 /// Whether anything lies on the rays between their origins and `t` = 1.
-static inline Mask trace_any_few(
+LARGE_FUNCTION Mask trace_any_corners(
     __global const Params *params,
     Mask active,
     Vec3 origin,

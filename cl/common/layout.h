@@ -4,6 +4,7 @@
 #define LEAF_BIT 0x80000000u // child[] is a block of triangles
 #define GROUP_BIT 0x40000000u // child[] of a LightPair is a group of lights for photons
 #define ALPHA_BIT 0x80000000u // id[] needs its alpha looked up
+#define PLATE_TURN 28u // bit of the number of a corner
 #define NO_HIT 0xFFFFFFFFu
 #define NO_LIGHT 0xFFFFFFFFu
 #define NO_VERTEX 0xFFFFFFFFu // it does not move
@@ -467,6 +468,8 @@ typedef struct {
     uint sampler; // SAMPLER_SOBOL or SAMPLER_RANDOM
     uint corner_count; // of the list of corners, where all triangles are tested
     uint face_count; // triangles between those corners
+    uint plate_count; // flat pieces that these make; 0: only corner by corner
+    uint pair_count; // plates, the first ones, that are parallelograms
     uint cell_min_count; // samples below which a cell gives way to a wider one
     uint cell_slots; // of the table of cells of one pass, a power of two
     uint cell_flags; // CELL_JITTER, CELL_NEAR, CELL_IDENTITY
@@ -508,7 +511,7 @@ typedef struct {
     float cache_steps; // fixed-point steps of a sum of radiance per unit, a power of two
     float cache_limit; // radiance from which a sample is too large for these sums
     float cache_trace; // least chance that a path goes on where a cell is known
-    uint pad[3]; // fills the record
+    uint pad[1]; // fills the record
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.
@@ -523,6 +526,17 @@ typedef struct {
     float v[9][4]; // vertex * 3 + axis; world, m
     uint id[4]; // triangle index, ALPHA_BIT set if its alpha must be looked up
 } TriangleBlock;
+
+/// A flat piece of a small scene's list: two triangles that make a parallelogram, or one.
+typedef struct {
+    float u[4]; // of a point (p, 1): how far it is along the first edge, of 1
+    float v[4]; // the same along the second
+    float n[4]; // how far it is off the plane, m
+    float slack; // by which u and v may be wrong for each meter from the origin
+    float slack_here; // the same for the plate's own distance
+    uint first; // triangle where u + v < 1, with ALPHA_BIT; its corner at u = v = 0 << PLATE_TURN
+    uint second; // the other one; its corner at u = v = 1 << PLATE_TURN
+} Plate;
 
 /// A node of the binary tree that the wide nodes are made from; one cache line.
 typedef struct {

@@ -6,13 +6,13 @@
 #include "lanes.h"
 #include "layout.h"
 #include "alpha.h"
-#include "few.h"
+#include "plates.h"
 #include "traverse.h"
 #include "instances.h"
 
 #if FEW
-#define TRIANGLE_BUFFERS __global const float *corners, __global const uint *faces
-#define TRIANGLE_ARGUMENTS corners, faces
+#define TRIANGLE_BUFFERS LIST_BUFFERS
+#define TRIANGLE_ARGUMENTS LIST_ARGUMENTS
 #elif INSTANCES
 #define TRIANGLE_BUFFERS                                                                           \
     __global const BvhNode *nodes, __global const TriangleBlock *blocks, __global const Instance *instances

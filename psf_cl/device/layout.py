@@ -109,6 +109,8 @@ PARAMS = Record(
     uint sampler - SAMPLER_SOBOL or SAMPLER_RANDOM
     uint corner_count - of the list of corners, where all triangles are tested
     uint face_count - triangles between those corners
+    uint plate_count - flat pieces that these make; 0: only corner by corner
+    uint pair_count - plates, the first ones, that are parallelograms
     uint cell_min_count - samples below which a cell gives way to a wider one
     uint cell_slots - of the table of cells of one pass, a power of two
     uint cell_flags - CELL_JITTER, CELL_NEAR, CELL_IDENTITY
@@ -169,6 +171,20 @@ TRIANGLE_BLOCK = Record(
     _fields("""
     float v[9][4] - vertex * 3 + axis; world, m
     uint id[4] - triangle index, ALPHA_BIT set if its alpha must be looked up
+    """),
+)
+
+PLATE = Record(
+    "Plate",
+    "A flat piece of a small scene's list: two triangles that make a parallelogram, or one.",
+    _fields("""
+    float u[4] - of a point (p, 1): how far it is along the first edge, of 1
+    float v[4] - the same along the second
+    float n[4] - how far it is off the plane, m
+    float slack - by which u and v may be wrong for each meter from the origin
+    float slack_here - the same for the plate's own distance
+    uint first - triangle where u + v < 1, with ALPHA_BIT; its corner at u = v = 0 << PLATE_TURN
+    uint second - the other one; its corner at u = v = 1 << PLATE_TURN
     """),
 )
 
@@ -718,6 +734,7 @@ RECORDS = (
     PARAMS,
     BVH_NODE,
     TRIANGLE_BLOCK,
+    PLATE,
     BINARY_NODE,
     SURFACE,
     INSTANCE,
@@ -1006,6 +1023,7 @@ CONSTANTS = (
     ("LEAF_BIT", 0x80000000, "child[] is a block of triangles"),
     ("GROUP_BIT", 0x40000000, "child[] of a LightPair is a group of lights for photons"),
     ("ALPHA_BIT", 0x80000000, "id[] needs its alpha looked up"),
+    ("PLATE_TURN", 28, "bit of the number of a corner"),
     ("NO_HIT", 0xFFFFFFFF, ""),
     ("NO_LIGHT", 0xFFFFFFFF, ""),
     ("NO_VERTEX", 0xFFFFFFFF, "it does not move"),
