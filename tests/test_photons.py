@@ -14,7 +14,7 @@ from psf_cl.device import layout
 from psf_cl.errors import InputError
 from psf_cl.plan import MANY_LIGHTS, make_plan
 from psf_cl.scene import primitives, transform
-from psf_cl.scene.model import Light
+from psf_cl.scene.model import Light, Mesh
 from psf_cl.settings import AOVS, Settings
 from psf_cl.stages.photons import VIEWS
 
@@ -235,6 +235,38 @@ def test_chances_of_all_lights_sum_to_one_in_a_thousand_cells(device):
     outputs = {"drawn": (np.uint32, 1), "chances": (np.float32, 1)}
     drawn, chance = run("draw_lights", {"points": points, "bits": bits}, outputs)
     np.testing.assert_allclose(chance, chances[np.arange(1000), drawn], rtol=2e-5)
+    opened.close()
+
+
+def test_what_a_lane_draws_does_not_hang_on_its_neighbours(device):
+    """Of 8,192 lights, for a quarter of a million numbers: some draws are close calls."""
+    axis = np.linspace(-1.0, 1.0, 65, dtype=np.float32)
+    corners = np.stack(np.meshgrid(axis, [2.0], axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    at = (np.arange(64)[:, None] * 65 + np.arange(64)).reshape(-1, 1) + np.array([0, 1, 65, 66])
+    triangles = np.concatenate([at[:, [0, 2, 1]], at[:, [1, 2, 3]]]).astype(np.uint32)
+    lamps = Mesh("lamps", corners.astype(np.float32), triangles)
+    parts = [(floor(3.0, lambertian(0.5))), (lamps, np.eye(4), glowing(1.0, double_sided=True))]
+    lit = build(parts, camera((0, 1, 3), (0, 0, 0)), (4, 4))
+    opened = open_renderer(device, lit, light_sampling="photon", photons=20000)
+    opened.render(spp=1)
+    names = ("params", "lights", "light_pairs", "light_places", "light_groups", "particle_table")
+    given = {name: opened.buffers[name] for name in names}
+    defines = {name: feature.value for name, feature in opened.plan.features.items()}
+    rng = np.random.default_rng(12)
+    points = np.zeros((6, 1 << 18), np.float32)
+    points[[0, 2]] = rng.uniform(-1.0, 1.0, (2, 1 << 18))
+    points[[1, 4]] = [[1e-4], [1.0]]
+    bits = rng.integers(0, 1 << 32, 1 << 18, dtype=np.uint32)
+
+    def drawn(order):
+        inputs = {"points": points[:, order], "bits": bits[order]}
+        outputs = {"drawn": (np.uint32, 1), "chances": (np.float32, 1)}
+        file = "light_choice_test.cl"
+        return planes.run(device, file, "draw_lights", inputs, outputs, defines, **given)[0]
+
+    # The smallest numbers ask for any light: in their order they are among themselves.
+    order = np.argsort(bits)
+    np.testing.assert_array_equal(drawn(order), drawn(slice(None))[order])
     opened.close()
 
 

@@ -284,9 +284,8 @@ static inline LightChoice choose_light(
     if (any_lane(blind)) {
         const LightChoice any = choose_in_table(lights, count, digits_left(u, kept, bits));
         group = pick_u(blind, GATHER_U(light_groups, any.light, node), group);
-        bits = mix_bits(bits);
     }
-    bits = pick_u(blind, bits, digits_left(u, part * (1.0f - kept), bits));
+    bits = pick_u(blind, mix_bits(bits), digits_left(u, part * (1.0f - kept), bits));
     const Mask there = active & (group != NO_LIGHT);
     const UInt pair = pick_u(there, group >> 1, (UInt)(0u));
     const UInt node = pick_u((group & 1u) == 0u, GATHER_U(light_pairs, pair, child[0]),
