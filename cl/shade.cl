@@ -17,6 +17,7 @@
 #include "common/guide.h"
 #include "common/guided.h"
 #include "common/cache.h"
+#include "common/material_cells.h"
 #include "common/motion.h"
 
 #define MAX_SURVIVAL 0.999f
@@ -193,7 +194,8 @@ static inline void store_choice(
 ///         with CELLS pool.{vertex, length, beyond, share, light_share}, vertices; with GUIDE
 ///         pool.{guide, guide_from, guide_light, expected}, guide_keys, guide_full, guide_sums,
 ///         counters.{guide_failed, guide_rejected} (atomic); with CACHE pool.{cache, cache_gate, cache_light},
-///         cache_keys, cache_full, cache_sums, counters.{cache_failed, cache_rejected, cache_ends} (atomic)
+///         cache_keys, cache_full, cache_sums, counters.{cache_failed, cache_rejected, cache_ends} (atomic); with
+///         MATERIAL_CELLS material_keys, material_full, material_sums, counters.material_failed (atomic)
 kernel void shade_paths(
     __global const Params *params,
     __global const Surface *surfaces,
@@ -238,8 +240,14 @@ kernel void shade_paths(
     __global float *chains,
     __global uint *chain_numbers,
 #endif
-#if GUIDE || CACHE
+#if GUIDE || CACHE || MATERIAL_CELLS
     volatile __global uint *counters,
+#endif
+#if MATERIAL_CELLS
+    volatile __global uint *material_keys,
+    __global uint *material_full,
+    __global MaterialSum *material_sums,
+    __global const MaterialCell *material_cells,
 #endif
 #if CACHE
     volatile __global uint *cache_keys,
@@ -404,10 +412,17 @@ kernel void shade_paths(
 #else
     const Float anisotropy = (Float)(0.0f);
 #endif
-    const Bsdf b = fetch_bsdf(hit, s, u, v, anisotropy, materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS);
-
     const UInt sample = get_u(path, PATH_SAMPLE);
     const UInt pixel = get_u(path, PATH_PIXEL);
+#if MATERIAL_CELLS
+    const UInt move = mix_bits(mix_bits(get_u(path, PATH_SEED) + depth * 0x85ebca77u) + sample);
+    const Factors factors = shared_factors(params, counters, hit, !camera_ray, s, u, v, move,
+                                        materials TEXTURE_ARGUMENTS MATERIAL_CELL_ARGUMENTS);
+    const Bsdf b = bsdf_of(hit, s, u, v, anisotropy, factors, materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS);
+#else
+    const Bsdf b = fetch_bsdf(hit, s, u, v, anisotropy, materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS);
+#endif
+
 #if AOV_FEATURES
     const Mask first = alive & camera_ray;
     if (any_lane(first)) {

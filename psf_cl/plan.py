@@ -40,6 +40,7 @@ from psf_cl.stages import (
     film,
     guide,
     intersect,
+    material_cells,
     metropolis,
     photons,
     probes,
@@ -353,6 +354,7 @@ def make_plan(
         screen,
         guide,
         cache,
+        material_cells,
         restore,
     ):
         stage = module.plan(context)
@@ -526,6 +528,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "no material has a texture",
         ),
         "TEXTURE_LEVELS": _texture_levels(scene, settings),
+        "MATERIAL_CELLS": _material_cells(settings, materials),
         "ALPHA": Feature(
             (2 if blended else 1) if cut_out else 0,
             ("a material blends" if blended else "a material is cut out by its alpha")
@@ -632,6 +635,17 @@ def _texture_levels(scene: Scene, settings: Settings) -> Feature:
     if not count:
         return Feature(0, "no material has a texture of more than a texel that may be blurred")
     return Feature(1, f"later vertices see {count} textures as coarsely as paths are apart")
+
+
+def _material_cells(settings: Settings, materials: list[Material]) -> Feature:
+    """Return whether later vertices fetch what textures give once a cell, and why."""
+    if settings.material_cache == "off":
+        return Feature(0, "material_cache is off")
+    if settings.max_depth == 0:
+        return Feature(0, "max_depth is 0: there are no later vertices")
+    if not any(m.base_color_texture >= 0 or m.metallic_roughness_texture >= 0 for m in materials):
+        return Feature(0, "no material has a texture of its base colour, or of roughness and metal")
+    return Feature(1, "later vertices fetch what textures give once a cell")
 
 
 def _rectangles(scene: Scene, settings: Settings, connected: bool) -> Feature:
@@ -846,6 +860,8 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     full["AOV_GUIDE"] = features["AOV_GUIDE"]
     # Paths would end elsewhere.
     full["CACHE"] = features["CACHE"]
+    # Means of texels would be read.
+    full["MATERIAL_CELLS"] = features["MATERIAL_CELLS"]
     if features["METROPOLIS"].value:
         names = (
             "AOV_BOUNCES",

@@ -49,6 +49,7 @@ from psf_cl.stages import (
     cells,
     film,
     guide,
+    material_cells,
     metropolis,
     photons,
     probes,
@@ -248,6 +249,8 @@ class Renderer:
             self._freeze_cache(start)
         if "guide_cells" in self.buffers or self.freeze_cache is not None:
             self._limit_learning(start)
+        if self.freeze_materials is not None:
+            self._freeze_materials(start)
         if self.chains is not None:
             is_first = start == self.scheduler.first
             self.chains.start() if is_first else self.chains.measure()
@@ -804,6 +807,7 @@ class Renderer:
             "guide": self._guide_statistics(counters),
             "cache": self._cache_statistics(counters, rays),
             "cells": self._cell_statistics(counters),
+            "materials": self._material_statistics(counters),
             "metropolis": self.chains.statistics() if self.chains else None,
             "photons": self.photon_map.counts() if self.photon_map else None,
             "bvh": None
@@ -849,6 +853,14 @@ class Renderer:
         fades = self._is_new(start) or (new_frame and self.changed)
         self.freeze_cache.set(fades=int(fades))
         self.freeze_cache(slots, film.GROUP)
+
+    def _freeze_materials(self, start: int) -> None:
+        """Let later vertices of the epoch of pass ``start`` know what was looked up so far."""
+        if start == self.scheduler.first > 0 and self.changed:
+            # Textures have moved.
+            for name in material_cells.BUFFERS:
+                self.device.fill(self.buffers[name])
+        self.freeze_materials(material_cells.slots_of(self.plan.pixel_count), film.GROUP)
 
     def _is_new(self, start: int) -> bool:
         """Return whether what is known at pass ``start`` was learned from little."""
@@ -911,6 +923,18 @@ class Renderer:
             "ended_paths": layout.whole(counters, "cache_ends") / max(rays["camera"], 1),
             "failed_inserts": int(counters[layout.COUNTER_INDEX["cache_failed"]]),
             "rejected": int(counters[layout.COUNTER_INDEX["cache_rejected"]]),
+        }
+
+    def _material_statistics(self, counters: np.ndarray) -> dict[str, int | float] | None:
+        if self.freeze_materials is None:
+            return None
+        keys = self.device.read(self.buffers["material_keys"])
+        known = self.device.read(self.buffers["material_cells"])
+        return {
+            "cells": int(np.count_nonzero(keys)),
+            "load": float(np.count_nonzero(keys)) / len(keys),
+            "known_cells": int(np.count_nonzero(known["visits"])),
+            "failed_inserts": int(counters[layout.COUNTER_INDEX["material_failed"]]),
         }
 
     def _path_statistics(
@@ -1124,6 +1148,7 @@ class Renderer:
         values |= cell_history.parameters(settings, self.time)
         values |= guide.parameters(scene, settings, self.plan.pixel_count, values["scene_radius"])
         values |= cache.parameters(scene, settings, self.plan.pixel_count)
+        values |= material_cells.parameters(scene, settings, self.plan.pixel_count)
         values |= photons.parameters(settings, len(lights))
         for name, value in values.items():
             params[0][name] = value
@@ -1237,6 +1262,11 @@ class Renderer:
                 "freeze_cache", self.buffers, fades=0
             )
             self.renew_cache = programs["cache"].bind_planned("renew_cache", self.buffers)
+        self.freeze_materials: Launch | None = None
+        if "material_cells" in programs:
+            self.freeze_materials = programs["material_cells"].bind_planned(
+                "freeze_materials", self.buffers
+            )
         self.photon_map = None
         if "photons" in programs:
             intersect = next(s for s in self.plan.stages if s.name == "intersect").kernels[0]

@@ -123,6 +123,15 @@ class Settings:
         "footprint",
         doc="texels behind the first surface: all, or as coarse as paths are apart (biased)",
     )
+    material_cache: str = _choice(
+        "off",
+        "hash_grid",
+        doc="what textures give behind the first surface: looked up each time, or once a cell of a "
+        "hash grid (biased)",
+    )
+    material_cell_size: float = _number(
+        4.0, 1e-3, 1e6, doc="edge of a cell of material_cache, pixels"
+    )
     termination: str = _choice(
         "roulette",
         "off",
@@ -316,6 +325,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 METROPOLIS_NEEDS = {
     "guiding": "off",
     "indirect_light": "paths",
+    "material_cache": "off",
     "path_filter": "off",
     "screen_filter": "off",
     "shadow_rays": "1",

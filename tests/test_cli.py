@@ -492,6 +492,7 @@ def test_plan_follows_the_options(all_features, capsys):
         "INSTANCES",
         "LAYERS",
         "LIGHT_SAMPLING",
+        "MATERIAL_CELLS",
         "METROPOLIS",
         "MOTION",
         "RECTANGLES",

@@ -264,6 +264,7 @@ def test_every_flag_at_once_renders(wants):
         guiding="learned",
         cell_min_count=2,
         termination="cache",
+        material_cache="hash_grid",
         area_sampling="solid_angle",
         texture_level="footprint",
         shadow_rays="2",

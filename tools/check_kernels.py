@@ -150,6 +150,7 @@ JOBS = {
     "instances": Job(instances, "psf"),
     "hierarchy": Job(everything, "pt", {"light_sampling": "hierarchy"}, tree=False),
     "cache": Job(room_that_moves, "pt", {"termination": "cache"}, times=(1.0,)),
+    "material cache": Job(everything, "pt", {"material_cache": "hash_grid"}, times=(1.0,)),
     "rectangles": Job(room, "pt", {"area_sampling": "solid_angle"}, tree=False),
     "range search": Job(
         room, "psf", {"path_filter": "range_search", "filter_restore": False}, everything=True
@@ -179,6 +180,7 @@ JOBS = {
 SMALL_TABLES = (
     (psf_cl.stages.guide, "LEAST_SLOTS", 64),
     (psf_cl.stages.cache, "LEAST_SLOTS", 64),
+    (psf_cl.stages.material_cells, "LEAST_SLOTS", 64),
     (psf_cl.stages.photons, "CELLS", 64),
     (psf_cl.stages.metropolis, "CANDIDATES", 256),
     (psf_cl.stages.metropolis, "MUTATIONS_PER_EPOCH", 4),

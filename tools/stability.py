@@ -58,7 +58,7 @@ LEAST_SECONDS = 0.2
 
 #: Settings whose values other than the default bias an image of finitely many samples.
 BIASING = ("path_filter", "temporal", "screen_filter")
-BIASING_VALUES = {"termination": ("cache",)}
+BIASING_VALUES = {"material_cache": ("hash_grid",), "termination": ("cache",)}
 
 PAIRS = "pairs of settings"
 

@@ -101,6 +101,9 @@
 #ifndef CELLS
 #error "CELLS must be 0, 1 (all of a vertex's light is shared) or 2 (that of its diffuse base)"
 #endif
+#ifndef MATERIAL_CELLS
+#error "MATERIAL_CELLS must be 0 or 1 (later vertices fetch what textures give once a cell)"
+#endif
 #ifndef AOV_BOUNCES
 #error "AOV_BOUNCES must be 0 or 1"
 #endif

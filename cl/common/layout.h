@@ -77,6 +77,7 @@
 #define LUMINANCE_RED 0.2126f
 #define LUMINANCE_GREEN 0.7152f
 #define LUMINANCE_BLUE 0.0722f
+#define TEXEL_STEPS 16777216.0f // fixed-point steps of sums of texels, which are from 0 to 1
 #define SAME_SURFACE_COSINE 0.9f // normals further apart are those of different surfaces
 
 #define PATH_ORIGIN_X 0u // ray origin, world, m
@@ -413,10 +414,11 @@
 #define COUNTER_CACHE_REJECTED 32u // what is not finite, or too large for the sums of the radiance cache
 #define COUNTER_CACHE_ENDS 33u // low word; paths that ended by the radiance cache
 #define COUNTER_CACHE_ENDS_HIGH 34u // high word
-#define COUNTER_PENDING_CAMERA 35u // rays since the last film launch
-#define COUNTER_PENDING_BOUNCE 36u
-#define COUNTER_PENDING_SHADOW 37u
-#define COUNTER_FINISHED 38u // first of the ring: samples done of each pass in flight
+#define COUNTER_MATERIAL_FAILED 35u // vertices that found their part of the parameter cloud full
+#define COUNTER_PENDING_CAMERA 36u // rays since the last film launch
+#define COUNTER_PENDING_BOUNCE 37u
+#define COUNTER_PENDING_SHADOW 38u
+#define COUNTER_FINISHED 39u // first of the ring: samples done of each pass in flight
 
 #define PHOTONS_EMITTED 0u // with any power, also one that is not finite
 #define PHOTONS_DARK 1u // drawn where their light gives none
@@ -511,7 +513,9 @@ typedef struct {
     float cache_steps; // fixed-point steps of a sum of radiance per unit, a power of two
     float cache_limit; // radiance from which a sample is too large for these sums
     float cache_trace; // least chance that a path goes on where a cell is known
-    uint pad[1]; // fills the record
+    uint material_slots; // of the table of the parameter cloud, a power of two
+    float material_width; // edge of its cells, m per m from the camera
+    uint pad[3]; // fills the record
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.
@@ -932,6 +936,23 @@ typedef struct {
     float visits; // that it is made from; 0: nothing is known
     float pad[3]; // fills the record
 } CacheCell;
+
+/// What a cell of the parameter cloud gathers: 64-bit fixed-point sums.
+typedef struct {
+    uint low[5]; // of what textures gave: rgb of the base colour, roughness, metallic
+    uint high[5]; // of the same
+    uint count; // vertices that looked it up
+    uint pad; // fills the record
+} MaterialSum;
+
+/// What a cell of the parameter cloud knows, the same for a whole epoch.
+typedef struct {
+    float color[3]; // factor of the base colour that textures give
+    float roughness; // of the roughness
+    float metallic; // of the metallic part
+    uint visits; // that it is made from; 0: nothing is known
+    uint pad[2]; // fills the record
+} MaterialCell;
 
 /// What a cell of the guide gathers: 64-bit fixed-point sums of each part of the hemisphere.
 typedef struct {

@@ -142,20 +142,47 @@ LARGE_FUNCTION Float map_normal(
 }
 #endif
 
-/// Parameters of the BSDF in the lanes of `mask`; `anisotropy` is map_normal's.
-static inline Bsdf fetch_bsdf(
+/// Factors of a material's parameters that textures give: 1 where there is no texture.
+typedef struct {
+    Vec3 color;
+    Float roughness;
+    Float metallic;
+} Factors;
+
+/// Look the textures of the base colour, of roughness and metal up in the lanes of `mask`.
+static inline Factors fetch_factors(
+    Mask mask, SurfacePoint s, Float u, Float v, __global const Material *materials TEXTURE_PARAMETERS)
+{
+    Factors t;
+    t.color = vec3_all((Float)(1.0f));
+    t.roughness = (Float)(1.0f);
+    t.metallic = (Float)(1.0f);
+#if TEXTURES
+    Float alpha;
+    t.color = LOOK_UP(mask, s.material, base_color_texture, &alpha);
+#if GLOSSY
+    const Vec3 metal = LOOK_UP(mask, s.material, metallic_roughness_texture, &alpha);
+    t.roughness = metal.y;
+    t.metallic = metal.z;
+#endif
+#endif
+    return t;
+}
+
+/// Parameters of the BSDF in the lanes of `mask`; `anisotropy` is map_normal's, `factors` what fetch_factors gives.
+static inline Bsdf bsdf_of(
     Mask mask,
     SurfacePoint s,
     Float u,
     Float v,
     Float anisotropy,
+    Factors factors,
     __global const Material *materials TEXTURE_PARAMETERS COLOR_PARAMETERS)
 {
     Bsdf b;
     b.base_color = GATHER_COLOR(materials, s.material, base_color);
 #if TEXTURES
-    b.base_color = textured(mask, b.base_color, TEXTURE_OF(mask, s.material, base_color_texture), s.triangle,
-                            u, v TEXTURE_ARGUMENTS);
+    b.base_color = mul(b.base_color, factors.color);
 #endif
 #if VERTEX_COLORS
     b.base_color = mul(b.base_color, corner_color(s.triangle, u, v, colors));
@@ -165,9 +192,8 @@ static inline Bsdf fetch_bsdf(
     Float roughness = GATHER(materials, s.material, roughness);
 #if TEXTURES
     Float alpha;
-    const Vec3 metal = LOOK_UP(mask, s.material, metallic_roughness_texture, &alpha);
-    roughness *= metal.y;
-    b.metallic *= metal.z;
+    roughness *= factors.roughness;
+    b.metallic *= factors.metallic;
 #endif
     b.alpha = max(roughness * roughness, ALPHA_GGX_MIN);
     b.specular = GATHER(materials, s.material, specular);
@@ -205,6 +231,19 @@ static inline Bsdf fetch_bsdf(
     b.eta = pick(s.front | b.thin, ior, 1.0f / ior);
 #endif
     return b;
+}
+
+/// The same, with what the textures of every lane give.
+static inline Bsdf fetch_bsdf(
+    Mask mask,
+    SurfacePoint s,
+    Float u,
+    Float v,
+    Float anisotropy,
+    __global const Material *materials TEXTURE_PARAMETERS COLOR_PARAMETERS)
+{
+    const Factors factors = fetch_factors(mask, s, u, v, materials TEXTURE_ARGUMENTS);
+    return bsdf_of(mask, s, u, v, anisotropy, factors, materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS);
 }
 
 #if TRANSMISSION

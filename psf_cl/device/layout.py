@@ -152,6 +152,8 @@ PARAMS = Record(
     float cache_steps - fixed-point steps of a sum of radiance per unit, a power of two
     float cache_limit - radiance from which a sample is too large for these sums
     float cache_trace - least chance that a path goes on where a cell is known
+    uint material_slots - of the table of the parameter cloud, a power of two
+    float material_width - edge of its cells, m per m from the camera
     """),
 )
 
@@ -694,6 +696,29 @@ CACHE_CELL = Record(
     """),
 )
 
+MATERIAL_SUM = Record(
+    "MaterialSum",
+    "What a cell of the parameter cloud gathers: 64-bit fixed-point sums.",
+    _fields("""
+    uint low[5] - of what textures gave: rgb of the base colour, roughness, metallic
+    uint high[5] - of the same
+    uint count - vertices that looked it up
+    uint pad - fills the record
+    """),
+)
+
+MATERIAL_CELL = Record(
+    "MaterialCell",
+    "What a cell of the parameter cloud knows, the same for a whole epoch.",
+    _fields("""
+    float color[3] - factor of the base colour that textures give
+    float roughness - of the roughness
+    float metallic - of the metallic part
+    uint visits - that it is made from; 0: nothing is known
+    uint pad[2] - fills the record
+    """),
+)
+
 #: Parts of the hemisphere that the guide tells apart, a side of the square.
 GUIDE_SIDE = 8
 
@@ -772,6 +797,8 @@ RECORDS = (
     SPLAT_SUM,
     CACHE_SUM,
     CACHE_CELL,
+    MATERIAL_SUM,
+    MATERIAL_CELL,
     GUIDE_SUM,
     GUIDE_CELL,
     GUIDE_VIEW,
@@ -1002,6 +1029,7 @@ COUNTERS = (
     ("cache_rejected", "what is not finite, or too large for the sums of the radiance cache"),
     ("cache_ends", "low word; paths that ended by the radiance cache"),
     ("cache_ends_high", "high word"),
+    ("material_failed", "vertices that found their part of the parameter cloud full"),
     ("pending_camera", "rays since the last film launch"),
     ("pending_bounce", ""),
     ("pending_shadow", ""),
@@ -1017,6 +1045,7 @@ FLOAT_CONSTANTS = (
     ("LUMINANCE_RED", LUMINANCE[0], ""),
     ("LUMINANCE_GREEN", LUMINANCE[1], ""),
     ("LUMINANCE_BLUE", LUMINANCE[2], ""),
+    ("TEXEL_STEPS", 2.0**24, "fixed-point steps of sums of texels, which are from 0 to 1"),
     ("SAME_SURFACE_COSINE", 0.9, "normals further apart are those of different surfaces"),
 )
 CONSTANTS = (

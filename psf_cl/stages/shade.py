@@ -37,6 +37,7 @@ def plan(context: Context) -> StageSpec:
             "INSTANCES",
             "TEXTURES",
             "TEXTURE_LEVELS",
+            "MATERIAL_CELLS",
             "SMOOTH",
             "GLOSSY",
             "TRANSMISSION",
@@ -114,6 +115,8 @@ def _kernel(context: Context) -> KernelSpec:
     guide_bytes = 4 * (1 + 2 + 4 + 8 + 2 + 3) if context.on("GUIDE") else 0
     if context.on("CACHE"):
         records += [layout.CACHE_CELL, layout.CACHE_SUM]
+    if context.on("MATERIAL_CELLS"):
+        records += [layout.MATERIAL_CELL, layout.MATERIAL_SUM]
     feature_bytes = 3 * 16 if context.on("AOV_FEATURES") else 0
     feature_bytes += RAY_BYTES * max(context.features["SHADOW_RAYS"].value - 1, 0)
     feature_bytes += 16 if context.on("AOV_LIGHTS") else 0
@@ -122,5 +125,5 @@ def _kernel(context: Context) -> KernelSpec:
         reads=(*walk, *(("origin",) if chosen else ()), "hit", "sample", "pixel", "seed"),
         writes=(*walk, "origin", *shadow),
         record_bytes=sum(record.dtype.itemsize for record in records) + feature_bytes + guide_bytes,
-        hash_accesses=int(context.on("GUIDE")) + int(context.on("CACHE")),
+        hash_accesses=sum(map(context.on, ("GUIDE", "CACHE", "MATERIAL_CELLS"))),
     )
