@@ -125,7 +125,7 @@ static inline uint regenerate(
                     at, (__global float *)beyond);
 #endif
         }
-        count_finished(tally, done, pass, counters);
+        count_finished(tally, done, pass, params->ring, counters);
     }
 
     const Mask free = is_free(status);
@@ -224,10 +224,7 @@ kernel void regenerate_paths(
         wanted += count_lanes(is_free(get_u(pool_at(pool, item), PATH_STATUS)));
     uint claimed = wanted > 0 ? atomic_add(&counters[COUNTER_NEXT_PIXEL], wanted) : 0;
     Tally tally;
-    tally.pass = 0;
-    tally.finished = 0;
-    tally.started = 0;
-    tally.dark = 0;
+    clear_tally(&tally);
     for (uint item = first; item < end; ++item)
         claimed = regenerate(params, pool_at(pool, item), claimed, &tally, counters,
 #if AOV_DIRECT
@@ -243,7 +240,7 @@ kernel void regenerate_paths(
                              beyond,
 #endif
                              samples);
-    hand_in(&tally, counters);
+    hand_in(&tally, params->ring, counters);
     if (tally.dark > 0)
         add_fixed(&counters[COUNTER_DARK_SAMPLES], &counters[COUNTER_DARK_SAMPLES_HIGH], tally.dark, 0u);
     if (tally.started > 0)

@@ -109,7 +109,7 @@ static inline void finish(
     Mask moves = first;
     if (any_lane(mutation)) {
         moves |= settle(params, chain, brightness, splats, counters, mutation, seed, index, pixel, radiance);
-        count_finished(tally, mutation, get_u(chain, CHAIN_PASS) & (params->ring - 1u), counters);
+        count_finished(tally, mutation, get_u(chain, CHAIN_PASS) & (params->ring - 1u), params->ring, counters);
     }
     if (any_lane(moves)) {
         const UInt depth = get_u(path, PATH_STATUS) & DEPTH_MASK;
@@ -206,9 +206,7 @@ kernel void mutate_paths(
     const uint pass_limit = min(counters[COUNTER_PASS_LIMIT], counters[COUNTER_FILM_PASS] + params->ring);
     const uint chain_limit = counters[COUNTER_CHAIN_LIMIT];
     Tally tally;
-    tally.pass = 0;
-    tally.finished = 0;
-    tally.started = 0;
+    clear_tally(&tally);
     for (uint item = first; item < end; ++item) {
         __global Float *path = pool_at(pool, item);
         __global Float *chain = chain_at(chains, item);
@@ -224,7 +222,7 @@ kernel void mutate_paths(
         if (any_lane(free))
             tally.started += start(params, path, chain, numbers, id, free, pass_limit, chain_limit, starts);
     }
-    hand_in(&tally, counters);
+    hand_in(&tally, params->ring, counters);
     if (tally.started > 0)
         atomic_add(&counters[COUNTER_PENDING_CAMERA], tally.started);
     // The last pass that may have begun.

@@ -14,23 +14,38 @@ static inline UInt exponent_bits(Vec3 v)
 // From 2^96 on, a film's sums could overflow.
 #define MAX_EXPONENT_BITS 0x6f800000u
 
+// Passes that the paths of a work item end in at about the same time.
+#define TALLY_PASSES 4u
+
 /// What a work item counts on its way, to disturb the others seldom.
 typedef struct {
-    uint pass;     // of the ring
-    uint finished; // samples of that pass
-    uint started;  // paths
-    uint dark;     // samples that gathered nothing
+    uint pass;                   // of the ring
+    uint finished[TALLY_PASSES]; // samples of that pass and of those after it
+    uint started;                // paths
+    uint dark;                   // samples that gathered nothing
 } Tally;
 
-static inline void hand_in(Tally *tally, volatile __global uint *counters)
+static inline void clear_tally(Tally *tally)
 {
-    if (tally->finished > 0)
-        atomic_add(&counters[COUNTER_FINISHED + tally->pass], tally->finished);
-    tally->finished = 0;
+    tally->pass = 0;
+    for (uint k = 0; k < TALLY_PASSES; ++k)
+        tally->finished[k] = 0;
+    tally->started = 0;
+    tally->dark = 0;
+}
+
+static inline void hand_in(Tally *tally, uint ring, volatile __global uint *counters)
+{
+    for (uint k = 0; k < TALLY_PASSES; ++k) {
+        if (tally->finished[k] > 0)
+            atomic_add(&counters[COUNTER_FINISHED + ((tally->pass + k) & (ring - 1u))], tally->finished[k]);
+        tally->finished[k] = 0;
+    }
 }
 
 /// Count the samples of the lanes in `done` to their passes of the ring.
-static inline void count_finished(Tally *tally, Mask done, UInt pass, volatile __global uint *counters)
+static inline void count_finished(
+    Tally *tally, Mask done, UInt pass, uint ring, volatile __global uint *counters)
 {
     uint lane_pass[W];
     store_lanes_u(pass, lane_pass);
@@ -40,10 +55,12 @@ static inline void count_finished(Tally *tally, Mask done, UInt pass, volatile _
             break;
         const uint counted = lane_pass[lowest_bit(left)];
         const Mask same = done & (pass == counted);
-        if (counted != tally->pass)
-            hand_in(tally, counters);
-        tally->pass = counted;
-        tally->finished += count_lanes(same);
+        if (((counted - tally->pass) & (ring - 1u)) >= TALLY_PASSES) {
+            hand_in(tally, ring, counters);
+            // The next may be of the pass before.
+            tally->pass = (counted - 1u) & (ring - 1u);
+        }
+        tally->finished[(counted - tally->pass) & (ring - 1u)] += count_lanes(same);
         done &= !same;
     }
 }
