@@ -183,17 +183,22 @@ def test_the_table_tells_good_from_bad(tool, device, monkeypatch, tmp_path, caps
     monkeypatch.setattr(tool, "open_device", lambda name: device)
     case = tool.CASES[[case.name for case in tool.CASES].index("depth 1")]
     cases = [case, dataclasses.replace(case, name="depth 1, wrong", truth=1.05)]
-    cases += [dataclasses.replace(case, name="depth 1, refused", settings={"max_depth": -1})]
+    below = {"max_depth": -1}
+    cases += [dataclasses.replace(case, name="depth 1, refused", settings=below)]
+    cases += [dataclasses.replace(cases[-1], name="depth 1, rightly refused", refused=("pt",))]
+    cases += [dataclasses.replace(case, name="depth 1, not refused", refused=("pt",))]
     monkeypatch.setattr(tool, "CASES", cases)
     arguments = "--presets pt --cases depth --edge 16 --no-times --spp 256 -o".split()
     assert tool.main([*arguments, str(tmp_path)]) == 1
-    assert "3 rows, 2 failed, 0 missing" in capsys.readouterr().out
+    assert "5 rows, 3 failed, 0 missing" in capsys.readouterr().out
     text = (tmp_path / "stability.csv").read_text()
-    good, wrong, refused = text.splitlines()[1:]
+    good, wrong, refused, rightly, not_refused = text.splitlines()[1:]
     assert good.startswith("depth 1,pt,ok,")
     assert "FAILED,the mean is off," in wrong and "max_depth must be from 0" in refused
+    assert ",ok,refused: " in rightly and "max_depth must be from 0" in rightly
+    assert "FAILED,it is not refused," in not_refused
     page = (tmp_path / "stability.html").read_text()
-    assert page.count("<tr") == 4 and page.count("class=failed") == 2
+    assert page.count("<tr") == 6 and page.count("class=failed") == 3
 
 
 def test_jobs_of_the_simulator_are_renders_that_are_not_refused(tool):

@@ -240,6 +240,8 @@ class Bench:
     def row(self, case: Case, preset: str) -> dict[str, Any]:
         """Return one row of the table."""
         row: dict[str, Any] = dict.fromkeys(COLUMNS, "") | {"case": case.name, "preset": preset}
+        if preset in case.refused:
+            return row | self._refusal(case, preset)
         try:
             seen = self.render(case, preset)
             truth, error, largest = self.truth(case)
@@ -272,6 +274,15 @@ class Bench:
             "of calm": "" if ratio is None else round(ratio, 2),
             "counters": " ".join(f"{k}={_number(v)}" for k, v in seen.counters.items()),
         }
+
+    def _refusal(self, case: Case, preset: str) -> dict[str, Any]:
+        """Return the verdict on a case that has to be refused in one line."""
+        try:
+            make_plan(self.scene(case), self.settings(case, preset), traits=self.device.traits)
+        except InputError as error:
+            text = str(error)
+            return {"verdict": "FAILED" if "\n" in text else "ok", "why": f"refused: {text}"}
+        return {"verdict": "FAILED", "why": "it is not refused"}
 
     def _time(self, case: Case, preset: str, seen: Picture) -> tuple[float | None, Picture]:
         """Return the time a sample over that of the calm case; the best where it is bad."""

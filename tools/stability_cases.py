@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from psf_cl.device.layout import COUNTER_INDEX
+from psf_cl.device.layout import CELL_HISTORY, COUNTER_INDEX, HISTORY
 from psf_cl.renderer import Renderer
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.curve import Curve
@@ -46,6 +46,7 @@ class Case:
         fireflies: largest pixel at most, as a multiple of that of the picture that looks the same;
             None if nothing is known about it.
         prepare: what is done with the renderer before it renders.
+        refused: presets whose settings do not go with these.
     """
 
     name: str
@@ -60,6 +61,7 @@ class Case:
     size: tuple[int, int] | None = None
     fireflies: float | None = 4.0
     prepare: Callable[[Renderer], None] = lambda renderer: None
+    refused: tuple[str, ...] = ()
 
 
 def grey(value: float) -> tuple[float, float, float]:
@@ -263,6 +265,22 @@ def after_a_second(renderer: Renderer) -> None:
     renderer.set_frame(1.0)
 
 
+def after_a_whole_frame(renderer: Renderer) -> None:
+    """Render a frame of as many samples as are usual, and begin the next one."""
+    renderer.render(spp=64)
+    renderer.set_frame(1.0)
+
+
+def after_many_frames(renderer: Renderer) -> None:
+    """Begin a frame as if those before had been 2^26 samples."""
+    after_a_whole_frame(renderer)
+    records = {"history": HISTORY.dtype, "kept_cells": CELL_HISTORY.dtype}
+    for name in records.keys() & renderer.buffers.keys():
+        history = renderer.device.read(renderer.buffers[name]).view(records[name])
+        history["count"] *= np.float32(2.0**20)
+        renderer.device.write(renderer.buffers[name], history)
+
+
 def after_passes(count: int) -> Callable[[Renderer], None]:
     """Return what begins a frame as if ``count`` passes had gone before."""
 
@@ -272,6 +290,22 @@ def after_passes(count: int) -> Callable[[Renderer], None]:
         renderer.set_frame(0.0)
 
     return begin
+
+
+def sequence_case(
+    name: str,
+    rule: str,
+    prepare: Callable[[Renderer], None] = after_a_whole_frame,
+    **settings: Any,
+) -> Case:
+    """Return a case of the room in the second frame of a sequence in which nothing moves."""
+    return room_case(
+        name,
+        None,
+        settings={"temporal": rule, **settings},
+        prepare=prepare,
+        refused=("mlt",),
+    )
 
 
 # Furnaces: a closed room of one albedo whose walls glow such that all of it has the radiance 1.
@@ -395,6 +429,11 @@ CASES: tuple[Case, ...] = (
         scene=lambda edge: room_that_moves(edge, 1e5),
         prepare=after_a_second,
     ),
+    *(
+        sequence_case(f"newest frame weighs {alpha:g}", "exponential", temporal_alpha=alpha)
+        for alpha in (1e-6, 1.0)
+    ),
+    sequence_case("after 2^26 samples", "cumulative", prepare=after_many_frames),
     furnace_case("tiny cells", None, depth=3, settings=TINY_CELLS),
     furnace_case("huge cells", None, depth=3, settings=HUGE_CELLS),
     room_case("tiny cells in the room", None, settings=TINY_CELLS),
