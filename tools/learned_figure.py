@@ -10,6 +10,7 @@ pictures, above for equal paths and below for equal time, to ``-o``.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import sys
 import time
@@ -19,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from psf_cl.cli.common import positive_integer, size_argument
+from psf_cl.device.device import Device, open_device
 from psf_cl.errors import DeviceError, InputError
 from psf_cl.image import Image, read_exr, tone_map, write_png_pixels
 from psf_cl.measure.errors import compare
@@ -47,13 +49,23 @@ class Run(NamedTuple):
 
 
 def rendered(
-    scene: Scene, preset: str, values: dict[str, str], paths: int, budget: float | None
+    device: Device,
+    scene: Scene,
+    preset: str,
+    values: dict[str, str],
+    paths: int,
+    budget: float | None,
 ) -> Run:
     """Render ``paths`` paths a pixel, or as many as fit into ``budget``, processor seconds."""
     settings = resolve(scene.render, scene.path, preset, values)
     # Neither chains nor what pixels share shows as a difference between halves.
     halves = settings.integrator == "path" and settings.termination != "cache"
-    renderer = Renderer(scene, settings, halves=halves)
+    if settings.guiding != "off":
+        # Where the guide does not pay, programs without it take over: they are built by now.
+        unguided = dataclasses.replace(settings, guiding="off")
+        with contextlib.closing(Renderer(scene, unguided, device, halves=halves)) as other:
+            other.render(spp=1)
+    renderer = Renderer(scene, settings, device, halves=halves)
     try:
         renderer.render(spp=1)
         start = time.process_time()
@@ -102,11 +114,11 @@ def run(args: argparse.Namespace) -> int:
     reference = reduced(args.reference, *args.size) if args.reference else None
     print("| | paths | processor seconds | rays a path | without light | relMSE | by its halves |")
     print("|---|---|---|---|---|---|---|")
-    rows, budget = [], None
+    device, rows, budget = open_device(), [], None
     for title in ("equal paths", "equal time"):
         row = []
         for name, (preset, values) in RUNS.items():
-            image, seconds, noise = rendered(scene, preset, values, args.paths, budget)
+            image, seconds, noise = rendered(device, scene, preset, values, args.paths, budget)
             row.append(image)
             if title == "equal paths" and name == "BSDF sampling":
                 plain = seconds
