@@ -128,12 +128,15 @@ kernel void store_photons(
 
 /// Write down those that have won their places so far.  After store_photons, before the pool is used again.
 ///
-/// reads   photons.shadow, particle_keys
-/// writes  particle_words
+/// reads   photons.{shadow, toward}, particle_keys
+/// writes  particle_words, particle_points
 kernel void settle_photons(
     __global const Params *params,
     __global float *photons,
     __global const uint *particle_keys,
+#if PHOTON_POINTS
+    __global uint *particle_points,
+#endif
     __global uint *particle_words)
 {
     const uint item = get_global_id(0);
@@ -142,30 +145,41 @@ kernel void settle_photons(
     __global Float *path = pool_at(photons, item);
     uint key[W];
     store_lanes_u(get_u(path, PATH_SHADOW_Z), key);
+#if PHOTON_POINTS
+    uint point[W];
+    store_lanes_u(get_u(path, PATH_TOWARD_X), point);
+#endif
     for (uint size = 0; size < PARTICLE_SIZES; ++size) {
         uint place[W];
         uint word[W];
         store_lanes_u(get_u(path, PLACE_FIELD + 2u * size), place);
         store_lanes_u(get_u(path, PLACE_FIELD + 2u * size + 1u), word);
         for (uint k = 0; k < W; ++k)
-            if (place[k] != NO_PLACE && particle_keys[place[k]] == key[k])
+            if (place[k] != NO_PLACE && particle_keys[place[k]] == key[k]) {
                 particle_words[place[k]] = word[k];
+#if PHOTON_POINTS
+                particle_points[place[k]] = point[k];
+#endif
+            }
     }
 }
 
 /// Make the table that paths ask of the places of the map.  One work item a row of them.
 ///
-/// reads   particle_words, particle_counts
+/// reads   particle_words, particle_counts, particle_points
 /// writes  particle_table
 kernel void tabulate_photons(
     __global const Params *params,
     __global const uint *particle_words,
     __global const uint *particle_counts,
+#if PHOTON_POINTS
+    __global const uint *particle_points,
+#endif
     __global uint *particle_table)
 {
     const uint row = get_global_id(0);
     if (row >= params->particle_cells)
         return;
-    tabulate_row(params, particle_words, particle_counts, particle_table, row);
+    tabulate_row(params, particle_words, particle_counts POINT_ARGUMENTS, particle_table, row);
 }
 #endif

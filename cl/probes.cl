@@ -156,6 +156,9 @@ static inline LightChoice light_for_probe(
     choice.light = pick_u(usual, choice.light, any);
     const Float chance = light_chance(params, lights CHOICE_ARGUMENTS, mask, choice.light, query);
     choice.pmf = 0.5f * chance + 0.5f / (float)params->light_count;
+#if PHOTON_POINTS
+    choice.stored = (Mask)(0);
+#endif
     return choice;
 }
 

@@ -721,7 +721,7 @@ def _aov_lights(outputs: frozenset[str], chosen: Feature) -> Feature:
     asked = sorted(outputs & {"light_pmf", *photons.VIEWS})
     if not asked:
         return Feature(0, "no image of the choice of lights was asked for")
-    return Feature(2 if chosen.value == 2 else 1, f"{', '.join(asked)} asked for")
+    return Feature(2 if chosen.value >= 2 else 1, f"{', '.join(asked)} asked for")
 
 
 def _without_light_aovs(outputs: frozenset[str], features: dict[str, Feature]) -> frozenset[str]:
@@ -913,6 +913,10 @@ def _light_sampling(settings: Settings, connected: bool, lights: int, scene: Sce
         return Feature(2, f"light_sampling is auto: photons of {lights} lights say which are seen")
     if settings.light_sampling == "hierarchy":
         return Feature(1, f"light_sampling is hierarchy: a tree of {lights} lights")
+    if settings.light_sampling == "photon_origin":
+        return Feature(
+            3, f"light_sampling is photon_origin: rays go where photons of {lights} lights began"
+        )
     return Feature(2, f"light_sampling is photon: photons of {lights} lights say which are seen")
 
 

@@ -257,8 +257,8 @@ class Renderer:
         if self.photon_map is not None:
             if start == self.scheduler.first:
                 self.photon_map.clear()
-            passes = len(self._epoch(start))
-            count = photons.photons_for(self.settings, passes, self.plan.pixel_count)
+            paths = len(self._epoch(start)) * self.plan.pixel_count
+            count = photons.photons_for(self.settings, paths, self.scheduler.rays)
             self.photon_map.add(count, self.scheduler.first)
 
     def _epoch_end(self, passes: int) -> int:
@@ -1212,8 +1212,9 @@ class Renderer:
         self.compile_seconds += warm_up_light_tree(self.device)
         start = time.perf_counter()
         share = tables.near_share(self.lights)
+        apart = self.settings.light_sampling == "photon_origin"
         self.light_tree = LightTree(
-            self.device, self.lights, self.buffers["lights"], share, geometry.radius
+            self.device, self.lights, self.buffers["lights"], share, geometry.radius, apart
         )
         self.buffers |= self.light_tree.buffers
         self.device.wait()

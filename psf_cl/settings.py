@@ -78,15 +78,20 @@ class Settings:
         "uniform",
         "hierarchy",
         "photon",
+        "photon_origin",
         doc="how next event estimation picks an emitter; hierarchy: a tree of lights asks for what "
-        "each might bring to a surface; photon: photons tell which of them see it; auto: photon "
+        "each might bring to a surface; photon: photons tell which of them see it; photon_origin: "
+        "and rays go to where these started, to compare: biased in soft shadows; auto: photon "
         "where there are many, else power",
     )
     photons: int = _number(
         0,
         0,
         1 << 28,
-        doc="photons before each epoch of light_sampling=photon; 0: a quarter of its paths",
+        doc="photons before each epoch of light_sampling=photon; 0: by photon_share",
+    )
+    photon_share: float = _number(
+        0.025, 1e-6, 100.0, doc="photons for each ray that the epoch's paths are expected to take"
     )
     photon_cell: float = _number(
         0.1, 1e-6, 1e6, doc="edge of the smallest cells of photons, by the distance to the camera"
@@ -354,6 +359,12 @@ def check_together(settings: Settings) -> None:
             "settings: termination=cache with a path_filter needs cache_trace=0, for averages take "
             f"no negative light; got {settings.cache_trace}"
         )
+    if settings.light_sampling == "photon_origin" and settings.area_sampling != "area":
+        # Densities of points by solid angle are not those that photons start with.
+        raise InputError(
+            "settings: light_sampling=photon_origin needs area_sampling=area; "
+            f"got {settings.area_sampling}"
+        )
     if settings.indirect_light == "virtual_lights":
         for key, value in VIRTUAL_LIGHTS_NEED.items():
             if getattr(settings, key) != value:
@@ -370,8 +381,11 @@ def check_together(settings: Settings) -> None:
             )
     if settings.termination == "cache":
         raise InputError("settings: integrator=metropolis goes with any termination but cache")
-    if settings.light_sampling == "photon":
-        raise InputError("settings: integrator=metropolis goes with any light_sampling but photon")
+    if settings.light_sampling.startswith("photon"):
+        raise InputError(
+            "settings: integrator=metropolis goes with any light_sampling but "
+            f"{settings.light_sampling}"
+        )
 
 
 def preset_values(name: str, prefix: str = "settings: ") -> dict[str, Any]:

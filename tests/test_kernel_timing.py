@@ -259,7 +259,7 @@ def full_plan():
     """Return a plan of everything but chains; what draws otherwise is on by its settings."""
     lights = (Light("point", (1.0, 1.0, 1.0)), Light("directional", (1.0, 1.0, 1.0)))
     scene = replace(small_scene(), lights=lights)
-    settings = Settings(guiding="learned", light_sampling="photon", termination="cache")
+    settings = Settings(guiding="learned", light_sampling="photon_origin", termination="cache")
     return make_plan(scene, settings, AOVS, statistics=True, full=True, halves=True)
 
 

@@ -1,6 +1,8 @@
 """Photons: what becomes of them, and images that do not depend on them."""
 
+import itertools
 import re
+from pathlib import Path
 
 import numpy as np
 import planes
@@ -14,10 +16,12 @@ from psf_cl.device import layout
 from psf_cl.errors import InputError
 from psf_cl.plan import MANY_LIGHTS, make_plan
 from psf_cl.scene import primitives, transform
+from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Light, Mesh
 from psf_cl.settings import AOVS, Settings
-from psf_cl.stages.photons import VIEWS
+from psf_cl.stages.photons import FEWEST, MOST, VIEWS, photons_for
 
+SCENES = Path(__file__).resolve().parents[1] / "scenes"
 PLACES = layout.CONSTANT["PARTICLE_PLACES"]
 SIZES = layout.CONSTANT["PARTICLE_SIZES"]
 
@@ -62,6 +66,21 @@ def test_every_photon_is_accounted_for(opened):
     # Keys tell photons apart: one that came alone is in one cell of each size at most.
     alone = keys[stored == 1]
     assert np.unique(alone, return_counts=True)[1].max() <= SIZES
+
+
+@pytest.mark.parametrize(
+    ("settings", "paths", "rays", "photons"),
+    [
+        ({"photons": 7}, 10**6, {"camera": 100, "bounce": 300}, 7),
+        # Two rays to expect of each path, 2.3 in truth; before the first are known, ten.
+        ({"photon_share": 0.5}, 10**6, {"camera": 100, "bounce": 30, "shadow": 100}, 10**6),
+        ({}, 10**6, {"camera": 0, "bounce": 0, "shadow": 0}, 250_000),
+        ({}, 100, {"camera": 100, "bounce": 100}, FEWEST),
+        ({"photon_share": 1.0}, 1 << 24, {"camera": 100, "bounce": 100}, MOST),
+    ],
+)
+def test_photons_are_as_many_as_was_said_or_a_share_of_the_rays(settings, paths, rays, photons):
+    assert photons_for(Settings(**settings), paths, rays) == photons
 
 
 def test_photons_are_shared_out_by_the_power_of_the_lamps(opened):
@@ -187,9 +206,72 @@ def test_rays_are_as_many_as_were_asked_for(device):
     assert shadow_rays(light_sampling="photon", shadow_rays="auto") == 3 * one
 
 
+def shadow_of_a_square(device, way, spp, size=1.0, **settings):
+    """Return a floor under two square lamps, half hidden from it, by direct light alone."""
+    down = inside_out(primitives.quad())
+
+    def at(x, y, z, half):
+        return transform.translation((x, y, z)) @ transform.scaling(half)
+
+    parts = [
+        floor(1.0, lambertian(0.5)),
+        (down, at(0.4, 1.5, 0.0, 0.25 * size), glowing(4.0 / size**2)),
+        (down, at(-0.6, 1.0, 0.3, 0.2 * size), glowing(2.0 / size**2)),
+        (primitives.box(), at(0.0, 0.5, 0.0, 0.1), lambertian(0.5)),
+    ]
+    scene = build(parts, camera((0, 4, 0.01), (0, 0, 0), 26), (16, 16))
+    values = {"sampler": "random", "max_depth": 1, "outputs": ["variance"]} | settings
+    return render(device, scene, spp, light_sampling=way, **values)
+
+
+def test_rays_to_where_photons_started_are_wrong_in_soft_shadows_alone(device):
+    """To lamps as small as points there is one place to go to; large ones are seen in part."""
+    exact = {"direct_sampling": "light"}
+    for size, agree in ((0.002, True), (1.0, False)):
+        truth = shadow_of_a_square(device, "power", 256, size, direct_sampling="light")
+        image = shadow_of_a_square(device, "photon_origin", 256, size, seed=1, **exact)
+        z = z_scores(image, truth, 4)
+        assert (np.abs(z).max() < 4.5) == agree
+        # Its bias: points that photons came from are those that are seen.
+        assert image.rgb.mean() == pytest.approx(truth.rgb.mean(), rel=0.01 if agree else 0.1)
+
+
+def test_rays_to_where_photons_started_share_their_light_with_rays_that_find_it(device):
+    """Weights of both ways sum to 1: without a photon the picture is that of fresh points."""
+    image = shadow_of_a_square(device, "photon_origin", 256, photons=1, photon_floor=1.0)
+    truth = shadow_of_a_square(device, "power", 256, seed=1)
+    assert np.abs(z_scores(image, truth, 4)).max() < 4.0
+
+
+def test_what_rays_to_where_photons_started_do_not_go_with_is_refused():
+    both = Settings(light_sampling="photon_origin", area_sampling="solid_angle")
+    with pytest.raises(InputError, match="light_sampling=photon_origin needs area_sampling=area"):
+        make_plan(many_kinds(), both)
+    chains = Settings(light_sampling="photon_origin", integrator="metropolis")
+    with pytest.raises(InputError, match="any light_sampling but photon_origin"):
+        make_plan(many_kinds(), chains)
+
+
 def test_chains_have_one_ray_at_a_vertex():
     with pytest.raises(InputError, match="integrator=metropolis needs shadow_rays=1; got 2"):
         make_plan(many_kinds(), Settings(integrator="metropolis", shadow_rays="2"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "spp"), [("many_lights", 512), ("cornell_box", 256)])
+def test_all_choices_of_lights_agree_on_the_projects_scenes(device, name, spp):
+    scene = load_scene(SCENES / f"{name}.toml", size=(32, 32))
+    settings = dict(scene.render) | {"sampler": "random", "outputs": ["variance"]}
+    settings.pop("preset", None)
+    images = [
+        render(device, scene, spp, light_sampling=way, seed=seed, **settings)
+        for seed, way in enumerate(("uniform", "power", "hierarchy", "photon"))
+    ]
+    for one, other in itertools.combinations(images, 2):
+        z = z_scores(one, other, 4)
+        # 16 blocks of six pairs: the largest of 96 standard normals is beyond 4.5 once in 1,500.
+        assert np.abs(z).max() < 4.5
+        assert stats.chi2.sf((z**2).sum(), z.size) > 1e-4
 
 
 @pytest.mark.slow

@@ -149,6 +149,7 @@ JOBS = {
     "exponential": Job(room_that_moves, "pt", {"temporal": "exponential"}, False, (1.0,)),
     "instances": Job(instances, "psf"),
     "hierarchy": Job(everything, "pt", {"light_sampling": "hierarchy"}, tree=False),
+    "photon origins": Job(room, "pt", {"light_sampling": "photon_origin"}),
     "cache": Job(room_that_moves, "pt", {"termination": "cache"}, times=(1.0,)),
     "material cache": Job(everything, "pt", {"material_cache": "hash_grid"}, times=(1.0,)),
     "rectangles": Job(room, "pt", {"area_sampling": "solid_angle"}, tree=False),

@@ -16,13 +16,6 @@ typedef struct {
     UInt point;  // of an area light: the two numbers that its point was drawn with, 16 bits each
 } Emission;
 
-/// Two numbers of 16 bits in [0, 1).
-static inline void light_point(UInt point, Float *u1, Float *u2)
-{
-    *u1 = (to_float(point & 0xffffu) + 0.5f) * 0x1p-16f;
-    *u2 = (to_float(point >> 16) + 0.5f) * 0x1p-16f;
-}
-
 /// Direction around `axis` at the angle whose cosine is given, `turns` around it.
 static inline Vec3 around(Vec3 axis, Float cosine, Float turns)
 {

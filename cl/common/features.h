@@ -50,9 +50,10 @@
 #error "CONNECT must be 0 or 1"
 #endif
 #ifndef LIGHT_SAMPLING
-#error "LIGHT_SAMPLING must be 0 (a table of chances), 1 (a tree of lights) or 2 (photons)"
+#error "LIGHT_SAMPLING must be 0 (a table of chances), 1 (a tree), 2 (photons) or 3 (where photons started)"
 #endif
-#define LIGHT_PHOTONS (LIGHT_SAMPLING == 2)
+#define LIGHT_PHOTONS (LIGHT_SAMPLING >= 2)
+#define PHOTON_POINTS (LIGHT_SAMPLING == 3)
 #ifndef VIRTUAL_LIGHTS
 #error "VIRTUAL_LIGHTS must be 0 or 1 (photons stand for reflected light)"
 #endif

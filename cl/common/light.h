@@ -28,6 +28,13 @@ static inline UInt alias_slot(UInt bits, uint count, Float *left)
     return mul_hi(bits, (UInt)(count));
 }
 
+/// The two numbers in [0, 1), 16 bits each, that a photon's point of its light was drawn with.
+static inline void light_point(UInt point, Float *u1, Float *u2)
+{
+    *u1 = (to_float(point & 0xffffu) + 0.5f) * 0x1p-16f;
+    *u2 = (to_float(point >> 16) + 0.5f) * 0x1p-16f;
+}
+
 static inline Float power_heuristic(Float a, Float b)
 {
     // Divided by the larger first: densities of tiny lights overflow when they are squared.
@@ -262,7 +269,8 @@ static inline Float group_chance(
 /// Draw a light for a surface.
 ///
 /// Of photons: a group of lights by how much of what it might bring came to the cell, but with a chance that
-/// is kept for what no photon saw, by its power; then one of the group by what each might bring.
+/// is kept for what no photon saw, by its power; then one of the group by what each might bring.  With
+/// PHOTON_POINTS groups are single lights, and the point on it is that of the photon.
 static inline LightChoice choose_light(
     __global const Params *params,
     __global const Light *lights CHOICE_PARAMETERS,
@@ -295,6 +303,10 @@ static inline LightChoice choose_light(
     choice.light = pick_u(there, drawn.light, (UInt)(0u));
     const Float chance = group_chance(particle_table, light_groups, there, q.row, choice.light);
     choice.pmf = pick(there, chance * drawn.inside, (Float)(0.0f));
+#if PHOTON_POINTS
+    choice.stored = known & !blind;
+    choice.point = node_point(particle_table, choice.stored, q.row, group);
+#endif
     return choice;
 #elif LIGHT_SAMPLING
     const TreeChoice drawn = descend_tree(light_pairs, count, active, (UInt)(0u), q.p, q.n, bits);
@@ -381,6 +393,14 @@ LARGE_FUNCTION LightSample sample_light(
     const UInt light = choice.light;
     const Float pmf = choice.pmf;
     const UInt kind = GATHER_U(lights, light, kind);
+#if PHOTON_POINTS
+    const Mask stored = choice.stored & (kind == LIGHT_TRIANGLE);
+    Float stored1;
+    Float stored2;
+    light_point(choice.point, &stored1, &stored2);
+    u1 = pick(stored, stored1, u1);
+    u2 = pick(stored, stored2, u2);
+#endif
 
     LightSample s;
     s.toward = vec3((Float)(0.0f), (Float)(0.0f), (Float)(1.0f));

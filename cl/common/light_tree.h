@@ -13,6 +13,10 @@
 typedef struct {
     UInt light;
     Float pmf;
+#if PHOTON_POINTS
+    Mask stored; // whether it is the light of a photon, and lit by the point that this one started from
+    UInt point;
+#endif
 } LightChoice;
 
 // Of two nodes that both may bring light, each is drawn at least this often: the other may be hidden.

@@ -94,7 +94,16 @@ static inline UInt particle_place(ParticleCell cell, UInt node)
 #define RECORD_NEWS 3u   // how likely the next particle is of a new kind, float
 #define RECORD_NODES 4u
 #define RECORD_SHARES (RECORD_NODES + PARTICLE_KINDS)
+#if PHOTON_POINTS
+#define RECORD_POINTS (RECORD_SHARES + PARTICLE_KINDS) // where on the light the particle started
+#define RECORD_WORDS (RECORD_POINTS + PARTICLE_KINDS)
+#define POINT_PARAMETERS , __global const uint *points
+#define POINT_ARGUMENTS , particle_points
+#else
 #define RECORD_WORDS (RECORD_SHARES + PARTICLE_KINDS)
+#define POINT_PARAMETERS
+#define POINT_ARGUMENTS
+#endif
 
 /// Return the print of the cell that most particles of a row of places came from; `*most`: how many.
 static inline uint main_cell(
@@ -138,15 +147,16 @@ static inline uint count_in_row(
 static inline void tabulate_row(
     __global const Params *params,
     __global const uint *words,
-    __global const uint *counts,
+    __global const uint *counts POINT_PARAMETERS,
     __global uint *table,
     uint row)
 {
+    const uint node_mask = (1u << params->node_bits) - 1u;
     const uint base = row * PARTICLE_PLACES;
     uint total;
     const uint print = main_cell(params, words, counts, base, &total);
     uint count[PARTICLE_KINDS];
-    uint node[PARTICLE_KINDS];
+    uint at_place[PARTICLE_KINDS];
     uint length = 0;
     uint alone = 0;
     for (uint place = base; place < base + PARTICLE_PLACES; ++place) {
@@ -160,21 +170,22 @@ static inline void tabulate_row(
         uint at = length < PARTICLE_KINDS ? length++ : PARTICLE_KINDS - 1u;
         for (; at > 0 && count[at - 1u] < own; --at) {
             count[at] = count[at - 1u];
-            node[at] = node[at - 1u];
+            at_place[at] = at_place[at - 1u];
         }
         count[at] = own;
-        node[at] = words[place] & ((1u << params->node_bits) - 1u);
+        at_place[at] = place;
     }
     for (uint i = 1; i < length; ++i) {
         const uint own = count[i];
-        const uint its_node = node[i];
+        const uint place = at_place[i];
         uint at = i;
-        for (; at > 0 && node[at - 1u] > its_node; --at) {
+        // Of one cell: what tells the words apart is the node.
+        for (; at > 0 && words[at_place[at - 1u]] > words[place]; --at) {
             count[at] = count[at - 1u];
-            node[at] = node[at - 1u];
+            at_place[at] = at_place[at - 1u];
         }
         count[at] = own;
-        node[at] = its_node;
+        at_place[at] = place;
     }
     uint kept_of = 0;
     for (uint i = 0; i < length; ++i)
@@ -183,7 +194,10 @@ static inline void tabulate_row(
     uint up_to = 0;
     for (uint i = 0; i < length; ++i) {
         up_to += count[i];
-        record[RECORD_NODES + i] = node[i];
+        record[RECORD_NODES + i] = words[at_place[i]] & node_mask;
+#if PHOTON_POINTS
+        record[RECORD_POINTS + i] = points[at_place[i]];
+#endif
         record[RECORD_SHARES + i] = as_uint((float)up_to / (float)kept_of);
     }
     const float news = ((float)alone + 1.0f) / ((float)total + 1.0f);
@@ -253,18 +267,37 @@ static inline UInt count_below(__global const uint *words, UInt first, UInt leng
     return count;
 }
 
+/// Return which of the nodes of a row `node` is; `*own`: whether it is one of them.
+static inline UInt node_index(__global const uint *table, Mask known, UInt row, UInt node, Mask *own)
+{
+    const UInt length = pick_u(known, record_word(table, row, RECORD_LENGTH), (UInt)(0u));
+    const UInt first = row * RECORD_WORDS + RECORD_NODES;
+    const UInt before = count_below(table, first, length, node);
+    const UInt i = pick_u(before < length, before, (UInt)(0u));
+    *own = (before < length) & (GATHER_WORD(table, first + i) == node);
+    return i;
+}
+
 /// Chance of `node` where one of a row is drawn.
 static inline Float node_chance(__global const uint *table, Mask active, UInt row, UInt node)
 {
     const Mask known = active & (row != NO_PLACE);
     row = pick_u(known, row, (UInt)(0u));
-    const UInt length = pick_u(known, record_word(table, row, RECORD_LENGTH), (UInt)(0u));
-    const UInt first = row * RECORD_WORDS + RECORD_NODES;
-    const UInt before = count_below(table, first, length, node);
-    const UInt i = pick_u(before < length, before, (UInt)(0u));
-    const Mask own = (before < length) & (GATHER_WORD(table, first + i) == node);
+    Mask own;
+    const UInt i = node_index(table, known, row, node, &own);
     return pick(own, node_share(table, row, i), (Float)(0.0f));
 }
+
+#if PHOTON_POINTS
+/// Where on the light of `node` the particle started that a row has of it.
+static inline UInt node_point(__global const uint *table, Mask active, UInt row, UInt node)
+{
+    row = pick_u(active, row, (UInt)(0u));
+    Mask own;
+    const UInt i = node_index(table, active, row, node, &own);
+    return GATHER_WORD(table, row * RECORD_WORDS + RECORD_POINTS + pick_u(own, i, (UInt)(0u)));
+}
+#endif
 
 /// 32 uniform bits of `u`, which is what is left of a number of 24 bits after a choice of chance `part`: it has
 /// only so many values, and the digits between them come from `more`.

@@ -18,9 +18,9 @@ _FAR = (CONSTANT["LIGHT_ENVIRONMENT"], CONSTANT["LIGHT_DIRECTIONAL"])
 _GROUP = 64
 
 #: Photons do not tell lights apart, but groups: subtrees of at most one part in so many of all.
-#: What is seen of large groups is soon known, and in them the tree picks well (measured: less error
-#: than with groups of the sides of a few lamps, the more so with few photons).
-LEAST_GROUPS = 32
+#: What is seen of large groups is soon known, and in them the tree picks well (measured: the least
+#: error of 4, 8, 16, 32, 128 and 512, with many photons too).
+LEAST_GROUPS = 16
 
 
 @dataclass(frozen=True)
@@ -52,16 +52,18 @@ class LightTree:
         lights: Buffer,
         near_share: float,
         radius: float,
+        apart: bool = False,
     ) -> None:
         """Join ``table``, layout.LIGHT, which ``lights`` holds too, and fit the tree.
 
         Args:
             near_share: chance that a light is drawn that is not infinitely far, if there are both.
             radius: of the scene, m.
+            apart: whether each light is a group of its own.
         """
         self.device = device
         self.program = _load(device)
-        topology = arrange(table, _join_near(device, table))
+        topology = arrange(table, _join_near(device, table), apart)
         pairs = np.zeros(len(topology.links), LIGHT_PAIR.dtype)
         pairs["child"] = topology.links
         self.buffers = {
@@ -143,11 +145,12 @@ def _join_near(device: Device, table: np.ndarray) -> np.ndarray:
     return tree[["left", "right"]]
 
 
-def arrange(table: np.ndarray, tree: np.ndarray) -> Topology:
+def arrange(table: np.ndarray, tree: np.ndarray, apart: bool = False) -> Topology:
     """Number the pairs of the binary ``tree`` of near lights, and add the lights that are far.
 
     Args:
         tree: fields ``left`` and ``right``: nodes, or a light and LEAF_BIT; the root is last.
+        apart: whether each light is a group of its own.
     """
     links: list[tuple[int, int]] = []
     far = [_LEAF | int(i) for i in np.flatnonzero(np.isin(table["kind"], _FAR))]
@@ -171,11 +174,12 @@ def arrange(table: np.ndarray, tree: np.ndarray) -> Topology:
         links.append((roots[1], roots[0]))
     elif not roots or roots[0] >= _LEAF:
         links.append((roots[0] if roots else _NONE, _NONE))
-    return _from_the_root(np.array(links, np.int64), len(table))
+    largest = 1 if apart else max(len(table) // LEAST_GROUPS, 1)
+    return _from_the_root(np.array(links, np.int64), len(table), largest)
 
 
-def _from_the_root(links: np.ndarray, light_count: int) -> Topology:
-    """Return the pairs, whose last one is the root, numbered from it."""
+def _from_the_root(links: np.ndarray, light_count: int, most: int) -> Topology:
+    """Return the pairs, whose last is the root, numbered from it; ``most`` lights in a group."""
     pairs = len(links)
     links = links[::-1]
     links = np.where(links < _LEAF, pairs - 1 - links, links)
@@ -197,7 +201,6 @@ def _from_the_root(links: np.ndarray, light_count: int) -> Topology:
         below[level] += np.where(inner, sizes[np.where(inner, links[level], 0)], 0)
         sizes[level] = below[level].sum(axis=1)
     # The root is no node of a pair: its children are the largest groups that there can be.
-    most = max(light_count // LEAST_GROUPS, 1)
     whole = np.where(np.arange(pairs) == 0, most + 1, sizes)[:, None]
     tops = (below > 0) & (below <= most) & (whole > most)
     groups = np.full(light_count, _NONE, np.uint32)

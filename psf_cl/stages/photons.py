@@ -23,9 +23,10 @@ MOST_DRAWN = (1 << 32) - 1
 # Odd, so that all frames begin elsewhere; 2^32 over the golden ratio, so that they do far apart.
 _FRAME_STEP = 0x9E3779B1
 
-#: Photons of an epoch if it is not said how many: as many as a share of its camera paths.
-SHARE_OF_PATHS = 0.25
+#: Photons of an epoch at least and at most where they are a share of its rays, and the rays of a
+#: path before any was traced.
 FEWEST, MOST = 1 << 14, 1 << 20
+RAYS_EXPECTED = 10
 
 #: Cells of the map, a power of two.
 CELLS = 1 << 15
@@ -38,15 +39,21 @@ VIEWS = ("photons", "lights")
 
 PLACES = layout.CONSTANT["PARTICLE_PLACES"]
 
-#: Words of what the table knows of a cell.
-RECORD_WORDS = 4 + 2 * layout.CONSTANT["PARTICLE_KINDS"]
+#: Words of what the table knows of a cell, and of each group of lights in it.
+RECORD_WORDS = 4
+KIND_WORDS = 2
 
 
-def photons_for(settings: Settings, passes: int, pixel_count: int) -> int:
-    """Return the photons to emit before an epoch of so many passes."""
+def photons_for(settings: Settings, paths: int, rays: Mapping[str, int]) -> int:
+    """Return the photons to emit before an epoch of so many ``paths``.
+
+    ``rays`` are those of the frame so far, by ``layout.RAY_KINDS``.  Of rays a path only the whole
+    number counts: devices may disagree on a few rays, and all of a map depends on its photons.
+    """
     if settings.photons:
         return settings.photons
-    return int(min(max(SHARE_OF_PATHS * passes * pixel_count, FEWEST), MOST))
+    traced = round(sum(rays.values()) / rays["camera"]) if rays["camera"] else RAYS_EXPECTED
+    return int(min(max(settings.photon_share * traced * paths, FEWEST), MOST))
 
 
 def parameters(settings: Settings, light_count: int) -> dict[str, object]:
@@ -63,12 +70,16 @@ def parameters(settings: Settings, light_count: int) -> dict[str, object]:
 
 def plan(context: Context) -> StageSpec | None:
     """Return the stage, or None if no photon is needed."""
-    mapped = context.features["LIGHT_SAMPLING"].value == 2
+    choice = context.features["LIGHT_SAMPLING"].value
+    mapped = choice >= 2
     if not (mapped or context.on("VIRTUAL_LIGHTS")):
         return None
     uint32 = np.dtype(np.uint32)
     places = CELLS * PLACES
+    kind_words = KIND_WORDS + (choice == 3)
+    record_words = RECORD_WORDS + kind_words * layout.CONSTANT["PARTICLE_KINDS"]
     words = context.traits.slots * context.path_field_count
+    settled = ("shadow_z", "toward_x") if choice == 3 else ("shadow_z",)
     ends = () if context.on("VIRTUAL_LIGHTS") else ("status",)
     emitting = (
         KernelSpec(
@@ -85,8 +96,8 @@ def plan(context: Context) -> StageSpec | None:
             record_bytes=layout.SURFACE.dtype.itemsize + 8,
             hash_accesses=1,
         ),
-        KernelSpec("settle_photons", reads=("shadow_z",), record_bytes=8, hash_accesses=1),
-        KernelSpec("tabulate_photons", record_bytes=8 * PLACES + 4 * RECORD_WORDS),
+        KernelSpec("settle_photons", reads=settled, record_bytes=8, hash_accesses=1),
+        KernelSpec("tabulate_photons", record_bytes=8 * PLACES + 4 * record_words),
     )
     flight = (
         BufferSpec("photons", np.dtype(np.float32), words, "photons in flight", True),
@@ -96,8 +107,11 @@ def plan(context: Context) -> StageSpec | None:
         BufferSpec("particle_keys", uint32, places, "least random number of each place"),
         BufferSpec("particle_counts", uint32, places, "photons that came to it"),
         BufferSpec("particle_words", uint32, places, "light and cell of the one that stayed"),
-        BufferSpec("particle_table", uint32, CELLS * RECORD_WORDS, "what each cell knows"),
+        BufferSpec("particle_table", uint32, CELLS * record_words, "what each cell knows"),
     )
+    if choice == 3:
+        what = "where on its light that one started"
+        table += (BufferSpec("particle_points", uint32, places, what),)
     return StageSpec(
         "photons",
         "photons say which lights a place sees" if mapped else "photons bring light to surfaces",
