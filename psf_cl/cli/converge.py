@@ -69,7 +69,7 @@ def add_parser(commands: Any) -> None:
         "--run",
         dest="runs",
         metavar="'NAME: KEY=VALUE ...'",
-        type=_run,
+        type=named_settings,
         action="append",
         default=[],
         help="one more contestant: a preset (preset=...) and settings; may be repeated",
@@ -406,7 +406,8 @@ def _named(text: str) -> tuple[str, str]:
     return name.strip(), rest.strip()
 
 
-def _run(text: str) -> tuple[str, list[tuple[str, str]]]:
+def named_settings(text: str) -> tuple[str, list[tuple[str, str]]]:
+    """Parse ``NAME: KEY=VALUE ...`` of a command line."""
     name, rest = _named(text)
     return name, [setting_argument(word) for word in rest.split()]
 

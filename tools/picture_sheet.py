@@ -1,8 +1,11 @@
-"""A sheet of pictures of many lights at equal times: ``python tools/light_picture.py -o FILE.png``.
+"""A sheet of pictures at equal times: ``python tools/picture_sheet.py [SCENE] -o FILE.png``.
 
-Each column is a way of choosing lights, alone or with the screen filter over the picture; each row
+Each column is a way to render, ``--run "NAME: KEY=VALUE ..."`` as in ``psf-cl converge``; each row
 a time, of all processors: a second of the machine is as many processor seconds as it has cores, so
 that other programs hardly matter.  Compiling and loading do not count.
+
+Without a scene and ways it is the picture of the talk (Binder, Keller 2019): many lights, chosen by
+the light hierarchy and by photons, alone and with the screen filter over the picture.
 """
 
 from __future__ import annotations
@@ -19,7 +22,8 @@ import PIL.Image
 import PIL.ImageDraw
 
 import psf_cl
-from psf_cl.cli.common import positive_number
+from psf_cl.cli.common import positive_number, size_argument
+from psf_cl.cli.converge import named_settings
 from psf_cl.device.device import Device, open_device
 from psf_cl.errors import DeviceError, InputError
 from psf_cl.image import Image, read_exr, tone_map, write_png_pixels
@@ -29,22 +33,24 @@ from psf_cl.scene.model import Scene
 from psf_cl.settings import resolve
 
 MANY_LIGHTS = Path(__file__).parents[1] / "scenes" / "many_lights.toml"
-SIZE = (160, 100)
 SECONDS = (1.0, 4.0)
 BAR = 14
 
-#: What is compared, by the names of its columns.
-WAYS = {
-    "light hierarchy": {"light_sampling": "hierarchy"},
-    "photons": {"light_sampling": "photon"},
-    "hierarchy, filtered": {"light_sampling": "hierarchy", "screen_filter": "path_space"},
-    "photons, filtered": {"light_sampling": "photon", "screen_filter": "path_space"},
-}
+Settings = Sequence[tuple[str, str]]
+
+TALK: list[tuple[str, Settings]] = [
+    ("light hierarchy", [("light_sampling", "hierarchy")]),
+    ("photons", [("light_sampling", "photon")]),
+    ("hierarchy, filtered", [("light_sampling", "hierarchy"), ("screen_filter", "path_space")]),
+    ("photons, filtered", [("light_sampling", "photon"), ("screen_filter", "path_space")]),
+]
 
 
-def render_for(scene: Scene, device: Device, values: dict[str, str], seconds: float) -> Image:
+def render_for(scene: Scene, device: Device, way: Settings, seconds: float) -> Image:
     """Return the picture after so many processor seconds, or after the first pass."""
-    renderer = Renderer(scene, resolve(scene.render, scene.path, None, values), device)
+    values = dict(way)
+    preset = values.pop("preset", None)
+    renderer = Renderer(scene, resolve(scene.render, scene.path, preset, values), device)
     end = time.process_time() + seconds
     renderer.render(spp=1 << 20, progress=lambda now: now.passes < 1 or time.process_time() < end)
     image = renderer.image()
@@ -73,27 +79,39 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("scene", nargs="?", default=MANY_LIGHTS, metavar="SCENE")
+    parser.add_argument(
+        "--run", dest="runs", type=named_settings, action="append", metavar="'NAME: KEY=VALUE ...'"
+    )
+    parser.add_argument("--size", type=size_argument, default=(160, 100), metavar="WxH")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.png")
     parser.add_argument("--seconds", type=positive_number, nargs="+", default=SECONDS)
     parser.add_argument("--exposure", type=float, default=0.0, help="stops")
-    parser.add_argument("--reference", type=Path, metavar="FILE.exr", help="to say the relMSE")
+    parser.add_argument(
+        "--reference", type=Path, metavar="FILE.exr", help="to show, and to say the relMSE"
+    )
     args = parser.parse_args(arguments)
     reference = read_exr(args.reference).rgb if args.reference else None
-    size = SIZE if reference is None else (reference.shape[1], reference.shape[0])
-    scene, device = psf_cl.load_scene(MANY_LIGHTS, size=size), open_device()
+    size = args.size if reference is None else (reference.shape[1], reference.shape[0])
+    scene, device = psf_cl.load_scene(args.scene, size=size), open_device()
     cores = os.cpu_count() or 1
     pictures, captions = [], []
     for seconds in args.seconds:
-        images = [render_for(scene, device, way, seconds * cores) for way in WAYS.values()]
-        texts = []
-        for name, image in zip(WAYS, images, strict=True):
+        row, texts = [], []
+        for name, way in args.runs or TALK:
+            image = render_for(scene, device, way, seconds * cores)
             text = f"{name}, {seconds:g} s"
-            texts.append(text)
-            text += f", {image.stats['spp']} spp"
+            worth = f"{text}, {image.stats['spp']} spp"
             if reference is not None:
-                text += f", relMSE {compare(image.rgb, reference).relmse:.3f}"
-            print(text)
-        pictures.append([tone_map(image.rgb, args.exposure) for image in images])
+                error = compare(image.rgb, reference).relmse
+                text, worth = f"{text}: {error:.2g}", f"{worth}, relMSE {error:.3g}"
+            print(worth)
+            row.append(tone_map(image.rgb, args.exposure))
+            texts.append(text)
+        if reference is not None:
+            row.append(tone_map(reference, args.exposure))
+            texts.append("reference")
+        pictures.append(row)
         captions.append(texts)
     write_png_pixels(args.output, sheet(pictures, captions))
     return 0
@@ -103,4 +121,4 @@ if __name__ == "__main__":
     try:
         sys.exit(main())
     except (InputError, DeviceError) as error:
-        sys.exit(f"light_picture: {error}")
+        sys.exit(f"picture_sheet: {error}")
