@@ -8,16 +8,18 @@
 static inline LightBounds bounds_of_light(__global const Light *light, float power_unit)
 {
     LightBounds b;
-    const int triangle = light->kind == LIGHT_TRIANGLE;
-    const int around = light->kind == LIGHT_POINT
+    const int sphere = (light->flags & LIGHT_SPHERE) != 0u;
+    const int triangle = light->kind == LIGHT_TRIANGLE && !sphere;
+    const float radius = sphere ? length(vload3(0, light->e1)) : 0.0f;
+    const int around = sphere || light->kind == LIGHT_POINT
                        || (triangle && (light->flags & MATERIAL_TWO_SIDED_EMISSION) != 0u);
     for (uint i = 0; i < 3; ++i) {
         const float p = light->position[i];
         const float q = triangle ? p + light->e1[i] : p;
         const float r = triangle ? p + light->e2[i] : p;
         const float s = light->flags & LIGHT_RECTANGLE ? q + (r - p) : p;
-        b.low[i] = min(min(p, s), min(q, r));
-        b.high[i] = max(max(p, s), max(q, r));
+        b.low[i] = min(min(p, s), min(q, r)) - radius;
+        b.high[i] = max(max(p, s), max(q, r)) + radius;
         b.axis[i] = light->direction[i];
     }
     b.power = clamp(light->power * power_unit, 0.0f, 1e36f);

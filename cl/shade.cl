@@ -363,6 +363,9 @@ kernel void shade_paths(
         pdf_light = rectangle_density(lights, sampled & !camera_ray, light, chance,
                                       get_v(path, PATH_ORIGIN_X), pdf_light);
 #endif
+#if SPHERES
+        pdf_light = sphere_density(lights, sampled & !camera_ray, light, get_v(path, PATH_ORIGIN_X), s.p, s.ng, pdf_light);
+#endif
         pdf_light = pick(sampled, pdf_light, (Float)(0.0f));
 #else
         const Float pdf_light = (Float)(0.0f);

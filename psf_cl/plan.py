@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,8 +55,8 @@ from psf_cl.stages import (
 )
 from psf_cl.stages.spec import BufferSpec, Context, Feature, StageSpec
 from psf_cl.tables import (
-    count_rectangles,
     count_texels,
+    count_whole_lights,
     flatten,
     leveled_textures,
     light_spread,
@@ -517,9 +517,9 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
     )
     connected = _connect(settings, any(emits(m) for m in materials) or sky, bool(lights))
     rectangles = _rectangles(scene, settings, bool(connected.value))
-    chosen = _light_sampling(
-        settings, bool(connected.value), _light_count(scene, bool(rectangles.value)), scene
-    )
+    spheres = _spheres(scene, settings, bool(connected.value))
+    kinds = whole_kinds({"RECTANGLES": rectangles, "SPHERES": spheres})
+    chosen = _light_sampling(settings, bool(connected.value), _light_count(scene, kinds), scene)
     feature_aovs = outputs & {"albedo", "normal", "depth"}
     return {
         "TEXTURES": switch(
@@ -568,6 +568,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
         ),
         "AREA_LIGHTS": switch(glows, "a shape emits", "no shape emits"),
         "RECTANGLES": rectangles,
+        "SPHERES": spheres,
         "PUNCTUAL_LIGHTS": switch(
             bool(lights),
             f"{len(lights)} lights without extent",
@@ -652,12 +653,32 @@ def _rectangles(scene: Scene, settings: Settings, connected: bool) -> Feature:
     """Return whether there are lights that are sampled by the solid angle that they fill."""
     if not connected:
         return Feature(0, "no light is sampled")
-    if settings.area_sampling == "area":
-        return Feature(0, "area_sampling is area")
-    count = count_rectangles(scene)
+    if settings.area_sampling != "solid_angle":
+        return Feature(0, f"area_sampling is {settings.area_sampling}")
+    count, _ = count_whole_lights(scene, "rectangles")
     if not count:
         return Feature(0, "no rectangle that stands still and glows evenly")
     return Feature(1, f"{count} lights are rectangles, sampled by the solid angle that they fill")
+
+
+def _spheres(scene: Scene, settings: Settings, connected: bool) -> Feature:
+    """Return whether there are spheres that are sampled by what is seen of them."""
+    if not connected:
+        return Feature(0, "no light is sampled")
+    if settings.area_sampling == "area":
+        return Feature(0, "area_sampling is area")
+    count, triangles = count_whole_lights(scene, "spheres")
+    if not count:
+        return Feature(0, "no sphere that stands still and glows evenly")
+    return Feature(
+        1, f"{count} lights are spheres ({triangles} triangles), sampled as they are seen"
+    )
+
+
+def whole_kinds(features: Mapping[str, Feature]) -> set[str]:
+    """Return which kinds of lights are more than a triangle, as `find_whole_lights` names them."""
+    names = {"RECTANGLES": "rectangles", "SPHERES": "spheres"}
+    return {kind for name, kind in names.items() if features[name].value}
 
 
 def _back_faces(settings: Settings, materials: list[Material]) -> Feature:
@@ -848,6 +869,7 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     # Other lights would be drawn, or other points of them: another image.
     full["LIGHT_SAMPLING"] = features["LIGHT_SAMPLING"]
     full["RECTANGLES"] = features["RECTANGLES"]
+    full["SPHERES"] = features["SPHERES"]
     full["SHADOW_RAYS"] = features["SHADOW_RAYS"]
     # Photons would stand for what paths bring.
     full["VIRTUAL_LIGHTS"] = features["VIRTUAL_LIGHTS"]
@@ -949,21 +971,22 @@ def _shadow_rays(settings: Settings, connected: Feature, chosen: Feature) -> Fea
     )
 
 
-def _light_count(scene: Scene, rectangles: bool) -> int:
-    """Return the entries of the light table, or a few more; of ``rectangles`` one for each."""
+def _light_count(scene: Scene, kinds: Collection[str]) -> int:
+    """Return the entries of the light table, or a few more; one for each light of ``kinds``."""
     emitting = sum(
         len(shape.mesh.triangles)
         for shape in scene.shapes
         if emits(scene.materials[shape.material])
     )
-    if rectangles:
-        emitting -= count_rectangles(scene)
+    for kind in kinds:
+        count, triangles = count_whole_lights(scene, kind)
+        emitting -= triangles - count
     return emitting + sum(map(shines, scene.lights)) + has_environment(scene.environment)
 
 
 def _scene_buffers(context: Context, scene: Scene) -> tuple[BufferSpec, ...]:
     triangles = context.triangle_count
-    lights = _light_count(scene, context.on("RECTANGLES"))
+    lights = _light_count(scene, whole_kinds(context.features))
     float32, uint8 = np.dtype(np.float32), np.dtype(np.uint8)
     buffers = [
         BufferSpec("params", layout.PARAMS.dtype, 1, "camera and settings"),

@@ -35,7 +35,7 @@ from psf_cl.image import Image
 from psf_cl.instancing import Placed, place
 from psf_cl.measure.errors import error_of_halves
 from psf_cl.mover import Mover
-from psf_cl.plan import Plan, Room, make_plan, restores
+from psf_cl.plan import Plan, Room, make_plan, restores, whole_kinds
 from psf_cl.scene import animation
 from psf_cl.scene.digest import scene_digest
 from psf_cl.scene.far import far_from_origin, moved
@@ -1028,7 +1028,7 @@ class Renderer:
             scene,
             geometry,
             self.settings.light_sampling,
-            self.plan.features["RECTANGLES"].value > 0,
+            whole_kinds(self.plan.features),
         )
         textures, texels = tables.texture_tables(
             scene.textures if "textures" in planned else (),

@@ -119,9 +119,11 @@ class Settings:
         "mis", "light", "bsdf", doc="direct light by both strategies, or by one of them alone"
     )
     area_sampling: str = _choice(
+        "auto",
         "area",
         "solid_angle",
-        doc="how points of rectangular lights are drawn: uniformly, or as they are seen",
+        doc="how points of lights are drawn: uniformly, or as spheres and rectangles are seen; "
+        "auto: spheres as they are seen",
     )
     texture_level: str = _choice(
         "full",

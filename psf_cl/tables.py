@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,6 +32,13 @@ from psf_cl.scene.model import (
 )
 from psf_cl.scene.texture import decoded_srgb, level_sizes, mean_color, smaller_levels
 from psf_cl.scene.transform import transform_points
+from psf_cl.whole_lights import (
+    MOST_IN_RECTANGLES,
+    find_whole_lights,
+    glows_evenly,
+    is_round,
+    lights_move,
+)
 
 #: Chance that the light table keeps for emitters of finite size where there is also light from
 #: infinitely far: its flux through the scene says little about how much of it comes in.
@@ -65,6 +72,7 @@ class Geometry:
         colors: ``(n,)`` layout.VERTEX_COLORS, or None if no mesh has colours.
         tangents: ``(n,)`` layout.TANGENTS, or None if no material asks for them.
         cut_out: ``(n,)`` bool, whether hits must look up their alpha.
+        shapes: what ``shape`` of the surfaces counts.
         center, radius: of a sphere around all finite vertices; world, m.
     """
 
@@ -75,6 +83,7 @@ class Geometry:
     colors: np.ndarray | None
     tangents: np.ndarray | None
     cut_out: np.ndarray
+    shapes: tuple[Shape, ...]
     center: np.ndarray
     radius: float
 
@@ -162,6 +171,7 @@ def flatten(scene: Scene, densities: bool = True) -> Geometry:
         joined(colors, layout.VERTEX_COLORS.dtype) if colored else None,
         joined(tangents, layout.TANGENTS.dtype) if directed else None,
         joined(cut_out, np.dtype(bool)),
+        tuple(shapes),
         0.5 * low + 0.5 * high,
         float(np.linalg.norm(high - low)) / 2,
     )
@@ -478,77 +488,23 @@ def alias_chances(keep: np.ndarray, other: np.ndarray) -> np.ndarray:
     return chance / len(keep)
 
 
-#: By how much, relative to their sizes, two triangles may miss a rectangle.
-RECTANGLE_SLACK = 1e-5
-
-#: More lights than these are not looked through for rectangles: each of them is small.
-MOST_IN_RECTANGLES = 4096
-
-
-def _lights_move(scene: Scene) -> bool:
-    """Return whether the table of lights is another one at another time."""
-    glow = any(material.emission_curve is not None for material in scene.materials)
-    return (
-        bool(scene.nodes)
-        or glow
-        or any(light.intensity_curve is not None for light in scene.lights)
-    )
-
-
-def _rectangles(scene: Scene, surfaces: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return ``(n,)`` bool: which of the ``triangles`` make a rectangle with the next one.
-
-    They follow one another in a mesh, share an edge, face one way and glow evenly.  No triangle is
-    in two; in scenes that move, or have very many lights, none is in any.
-
-    Args:
-        surfaces: ``(m,)`` layout.SURFACE of all triangles.
-        triangles: ``(n,)`` indices of those that emit, ascending.
-    """
-    whole = np.zeros(len(triangles), bool)
-    if _lights_move(scene) or not 2 <= len(triangles) <= MOST_IN_RECTANGLES:
-        return whole
-    even = np.array([m.alpha_mode == "opaque" and m.emission_texture < 0 for m in scene.materials])
-    a, b = surfaces[triangles[:-1]], surfaces[triangles[1:]]
-    together = (a["shape"] == b["shape"]) & (triangles[1:] == triangles[:-1] + 1)
-    together &= even[a["material"]] & ((a["ng"] * b["ng"]).sum(axis=1) > 0.999)
-    for first in np.flatnonzero(together):
-        if not (first and whole[first - 1]):
-            whole[first] = _rectangle(a[first], b[first]) is not None
-    return whole
-
-
-def _rectangle(a: np.void, b: np.void) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Return a corner and the edges from it of the rectangle that two triangles make, if any."""
-    one, other = (
-        np.stack([t["p0"], t["p0"] + t["e1"], t["p0"] + t["e2"]]).astype(np.float64) for t in (a, b)
-    )
-    size = np.ptp(np.concatenate([one, other]), axis=0).max()
-    same = np.abs(one[:, None] - other[None]).max(axis=2) <= RECTANGLE_SLACK * size
-    # One corner of each triangle is none of the other's; the two others are, each one of them.
-    apart, beyond = np.flatnonzero(~same.any(axis=1)), np.flatnonzero(~same.any(axis=0))
-    if same.sum() != 2 or len(apart) != 1 or len(beyond) != 1:
-        return None
-    k = int(apart[0])
-    corner = one[k]
-    e1, e2 = one[(k + 1) % 3] - corner, one[(k + 2) % 3] - corner
-    misses = np.abs(corner + e1 + e2 - other[beyond[0]]).max()
-    lengths = np.linalg.norm(e1) * np.linalg.norm(e2)
-    if misses > RECTANGLE_SLACK * size or abs(e1 @ e2) > RECTANGLE_SLACK * lengths:
-        return None
-    return corner, e1, e2
-
-
-def count_rectangles(scene: Scene) -> int:
-    """Return how many lights of the table are rectangles, if it is made with these."""
+def count_whole_lights(scene: Scene, kind: str) -> tuple[int, int]:
+    """Return how many lights are of ``kind`` if the table has these, and of how many triangles."""
     shapes = tuple(
-        shape for shape in visible_shapes(scene) if emits(scene.materials[shape.material])
+        shape for shape in visible_shapes(scene) if glows_evenly(scene.materials[shape.material])
     )
-    count = sum(len(shape.mesh.triangles) for shape in shapes)
-    if _lights_move(scene) or count > MOST_IN_RECTANGLES:
-        return 0
+    if kind == "spheres":
+        shapes = tuple(shape for shape in shapes if is_round(scene, shape))
+    elif sum(len(shape.mesh.triangles) for shape in shapes if not is_round(scene, shape)) > (
+        MOST_IN_RECTANGLES
+    ):
+        return 0, 0
+    if not shapes or lights_move(scene):
+        return 0, 0
     surfaces = flatten(replace(scene, shapes=shapes)).surfaces
-    return int(_rectangles(scene, surfaces, np.arange(len(surfaces))).sum())
+    every = np.arange(len(surfaces))
+    found = find_whole_lights(scene, shapes, surfaces, every, {kind})
+    return len(found), sum(light.count for light in found)
 
 
 def light_spread(scene: Scene) -> float:
@@ -578,7 +534,7 @@ def light_spread(scene: Scene) -> float:
 
 
 def light_table(
-    scene: Scene, geometry: Geometry, sampling: str, rectangles: bool = False
+    scene: Scene, geometry: Geometry, sampling: str, kinds: Collection[str] = ()
 ) -> np.ndarray:
     """Return ``(n,)`` layout.LIGHT; sets the surfaces' ``light``.
 
@@ -586,7 +542,7 @@ def light_table(
 
     Args:
         sampling: what the chances follow: ``"uniform"``, or else the power.
-        rectangles: whether two triangles that make a rectangle are one light.
+        kinds: of what triangles make one light together, as for `find_whole_lights`.
     """
     glow = np.array([emits(material) for material in scene.materials], bool)
     sided = np.array([2.0 if material.double_sided else 1.0 for material in scene.materials])
@@ -608,15 +564,16 @@ def light_table(
         area = np.where(sound, area, 0.0)
         sound[:] = True
     triangles, area = triangles[sound], area[sound]
-    whole = np.zeros(len(triangles), bool)
-    if rectangles:
-        whole = _rectangles(scene, geometry.surfaces, triangles)
-    second = np.flatnonzero(whole) + 1
-    area[whole] += area[second]
-    halves = triangles[second]
-    left = np.ones(len(triangles), bool)
-    left[second] = False
-    triangles, area, whole = triangles[left], area[left], whole[left]
+    emitting = triangles
+    whole = find_whole_lights(scene, geometry.shapes, geometry.surfaces, emitting, kinds)
+    own = np.ones(len(emitting), bool)
+    for light in whole:
+        rest = slice(light.first + 1, light.first + light.count)
+        area[light.first] += area[rest].sum()
+        own[rest] = False
+    triangles, area = emitting[own], area[own]
+    # The light of each triangle that emits: its own, or the one that it is a part of.
+    light_of = np.cumsum(own) - 1
 
     sky = has_environment(scene.environment)
     punctual = [light for light in scene.lights if shines(light)]
@@ -627,19 +584,22 @@ def light_table(
     table["triangle"][: len(triangles)] = triangles
     table["area"][: len(triangles)] = area
     _fill_triangles(table[: len(triangles)], geometry.surfaces[triangles], scene.materials)
-    geometry.surfaces["light"][triangles] = np.arange(len(triangles))
-    geometry.surfaces["light"][halves] = np.flatnonzero(whole)
-    for light, half in zip(np.flatnonzero(whole), halves, strict=True):
-        row, pair = table[light], geometry.surfaces[[triangles[light], half]]
-        row["position"], row["e1"], row["e2"] = _rectangle(*pair)
-        row["offset"] = pair["offset"].max()
-        row["flags"] |= layout.CONSTANT["LIGHT_RECTANGLE"]
+    geometry.surfaces["light"][emitting] = light_of
+    brightest = np.ones(len(triangles))
+    for light in whole:
+        row = table[light_of[light.first]]
+        parts = geometry.surfaces[emitting[light.first : light.first + light.count]]
+        for name in ("position", "e1", "e2", "direction"):
+            row[name] = getattr(light, name)
+        row["offset"] = parts["offset"].max()
+        row["flags"] |= light.flag
+        brightest[light_of[light.first]] = light.brightest
     of = material[triangles]
     power[: len(triangles)] = area * radiance[of] * sided[of] * math.pi
     # A texture may be black on average and still glow somewhere.
     power[: len(triangles)] = np.maximum(power[: len(triangles)], power.max(initial=0.0) * 1e-6)
     table["power"][: len(triangles)] = np.minimum(
-        power[: len(triangles)] / (sided[of] * math.pi), MOST_POWER
+        power[: len(triangles)] * brightest / (sided[of] * math.pi), MOST_POWER
     )
 
     at = len(triangles)

@@ -499,6 +499,7 @@ def test_plan_follows_the_options(all_features, capsys):
         "RESTORE",
         "SEEN",
         "SPARSE",
+        "SPHERES",
         "TANGENTS",
         "TEMPORAL",
         "TEXTURE_LEVELS",

@@ -252,7 +252,8 @@ def test_every_flag_at_once_renders(wants):
     shape = replace(scene.shapes[0], mesh=colored, material=len(scene.materials))
     lamp = replace(scene.shapes[0], mesh=FLAT_QUAD, material=len(scene.materials) + 1)
     materials = (*scene.materials, layered, glowing(1.0))
-    scene = replace(scene, shapes=(*scene.shapes, shape, lamp), materials=materials)
+    ball = replace(lamp, mesh=primitives.sphere(), transform=LIFTED)
+    scene = replace(scene, shapes=(*scene.shapes, shape, lamp, ball), materials=materials)
     opened = renderer(
         wants(flags),
         scene,

@@ -87,7 +87,7 @@ def under_a_lamp(height=0.3, **material):
 def test_quads_are_one_light_and_both_triangles_name_it():
     scene = under_a_lamp()
     geometry = tables.flatten(scene)
-    lights = tables.light_table(scene, geometry, "power", rectangles=True)
+    lights = tables.light_table(scene, geometry, "power", kinds={"rectangles"})
     assert len(lights) == 1
     assert lights["flags"][0] & layout.CONSTANT["LIGHT_RECTANGLE"]
     assert lights["area"][0] == pytest.approx(4.0)
@@ -116,7 +116,7 @@ def test_only_what_is_a_rectangle_and_glows_evenly_is_one():
         (quad, lambertian(1.0), 0),
     ):
         scene = build([(mesh, IDENTITY, material)], camera((0, 2, 5), (0, 0, 0)))
-        assert tables.count_rectangles(scene) == expected
+        assert tables.count_whole_lights(scene, "rectangles")[0] == expected
 
 
 SOLID = Settings(area_sampling="solid_angle")

@@ -118,6 +118,16 @@ def instances(edge: int) -> Scene:
     return dataclasses.replace(scene, shapes=(scene.shapes[0], scene.shapes[2], *balls))
 
 
+def lantern(edge: int) -> Scene:
+    """Return a glowing ball over a floor."""
+    place = transform.translation((0.0, 0.8, 0.0)) @ _half()
+    parts = [
+        (primitives.quad(), transform.scaling(2.0), matt(0.5)),
+        (primitives.sphere(), place, matt(0.0, emission=grey(5.0))),
+    ]
+    return scene_of(parts, camera((0.0, 1.0, 3.0), (0.0, 0.5, 0.0)), edge)
+
+
 @dataclass(frozen=True)
 class Job:
     """One picture, or the pictures of a sequence.
@@ -153,6 +163,7 @@ JOBS = {
     "cache": Job(room_that_moves, "pt", {"termination": "cache"}, times=(1.0,)),
     "material cache": Job(everything, "pt", {"material_cache": "hash_grid"}, times=(1.0,)),
     "rectangles": Job(room, "pt", {"area_sampling": "solid_angle"}, tree=False),
+    "spheres": Job(lantern, "photon"),
     "range search": Job(
         room, "psf", {"path_filter": "range_search", "filter_restore": False}, everything=True
     ),

@@ -95,9 +95,23 @@ LARGE_FUNCTION Emission emit(
 #endif
         const Mask two_sided = (flags & MATERIAL_TWO_SIDED_EMISSION) != 0u;
         const Float side = pick(two_sided & (side_bits >= 0x80000000u), (Float)(-1.0f), (Float)(1.0f));
-        const Vec3 outward = scale(axis, side);
-        const Vec3 origin = add_scaled(add_scaled(add_scaled(position, e1, b1), e2, b2), outward,
-                                       GATHER(lights, light, offset));
+        Vec3 outward = axis;
+        Vec3 origin = add_scaled(add_scaled(position, e1, b1), e2, b2);
+        Float area = GATHER(lights, light, area);
+#if SPHERES
+        const Mask round = on_triangle & ((flags & LIGHT_SPHERE) != 0u);
+        if (any_lane(round)) {
+            const Sphere sphere = fetch_sphere(lights, light);
+            const Vec3 n = around(sphere.y, 1.0f - 2.0f * u1, u2);
+            Vec3 face;
+            const Float r = face_along(sphere, n, &face);
+            origin = pick_v(round, add_scaled(sphere.center, n, r), origin);
+            outward = pick_v(round, face, outward);
+            area = pick(round, area_along((Float)(0.25f * INV_PI), n, r, face), area);
+        }
+#endif
+        outward = scale(outward, side);
+        origin = add_scaled(origin, outward, GATHER(lights, light, offset));
         Vec3 emission = intensity;
 #if TEXTURES
         emission = textured(on_triangle, emission, GATHER_U(lights, light, emission_texture), triangle, b1,
@@ -107,7 +121,7 @@ LARGE_FUNCTION Emission emit(
         emission = scale(emission, alpha_share(on_triangle, triangle, b1, b2 ALPHA_BUFFER_ARGUMENTS));
 #endif
         const Float sides = pick(two_sided, (Float)(2.0f), (Float)(1.0f));
-        const Vec3 power = scale(emission, PI * GATHER(lights, light, area) * sides * weight);
+        const Vec3 power = scale(emission, PI * area * sides * weight);
         e.origin = pick_v(on_triangle, origin, e.origin);
         e.direction = pick_v(on_triangle, around(outward, sqrt(1.0f - v1), v2), e.direction);
         e.power = pick_v(on_triangle, power, e.power);

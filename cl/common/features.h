@@ -40,6 +40,9 @@
 #ifndef RECTANGLES
 #error "RECTANGLES must be 0 or 1 (some area lights are)"
 #endif
+#ifndef SPHERES
+#error "SPHERES must be 0 or 1 (some area lights are)"
+#endif
 #ifndef PUNCTUAL_LIGHTS
 #error "PUNCTUAL_LIGHTS must be 0 or 1"
 #endif

@@ -23,6 +23,7 @@
 #define TEXTURE_NEAREST 16u
 #define TEXTURE_SRGB 32u
 #define LIGHT_RECTANGLE 256u // the light is two triangles: e1 and e2 are edges of a rectangle
+#define LIGHT_SPHERE 512u // the light is a sphere: many triangles
 #define LIGHT_TRIANGLE 0u
 #define LIGHT_ENVIRONMENT 1u
 #define LIGHT_POINT 2u
@@ -35,6 +36,8 @@
 #define SAMPLER_RANDOM 1u
 #define PAIR_VERTEX 2u // first pair of random numbers of the first vertex
 #define VERTEX_PAIRS 4u // pairs of each vertex
+#define SPHERE_COLUMNS 64u // of faces of a light that is a sphere
+#define SPHERE_ROWS 32u
 #define STRIP_ROWS 4u // rows of pixels that the queue takes column by column
 #define STATUS_IDLE 0u // the slot has no path yet
 #define STATUS_WAITING 0x40000000u // it holds a sample whose pass may not start yet
@@ -700,19 +703,19 @@ typedef struct {
     uint triangle; // index, for LIGHT_TRIANGLE
     float pmf; // chance to be picked
     float keep; // alias table: chance that the slot keeps its own index
-    float position[3]; // world, m; of a triangle the first corner
+    float position[3]; // world, m; of a triangle the first corner, of a sphere the center
     uint other; // alias table: the index otherwise
-    float direction[3]; // unit, the way the light travels; of a triangle the normal of its front
+    float direction[3]; // unit, the way of its light; of a triangle the front's normal, of a sphere y
     float range; // m, inf for none
     float intensity[3]; // candela, lux, or a triangle's radiance
     float cos_outer; // of the cone
-    float e1[3]; // of a triangle, second corner minus first
+    float e1[3]; // of a triangle, second corner minus first; of a sphere its x axis, m
     float spot_scale; // 1 / (cos inner - cos outer), floored
-    float e2[3]; // of a triangle, third corner minus first
+    float e2[3]; // of a triangle, third corner minus first; of a sphere its z axis, m
     float area; // m^2, of a triangle
     float offset; // of a triangle, as Surface.offset
     uint emission_texture; // index, NO_TEXTURE for none
-    uint flags; // of the material; LIGHT_RECTANGLE
+    uint flags; // of the material; LIGHT_RECTANGLE or LIGHT_SPHERE
     float power; // candela along its brightest direction, or lux from infinitely far
     float pad[4]; // fills the record
 } Light;

@@ -8,6 +8,7 @@
 #include "particle_map.h"
 #include "rectangle.h"
 #include "rng.h"
+#include "sphere.h"
 #include "surface.h"
 
 /// Light that arrives at a point from one sampled direction.
@@ -215,6 +216,23 @@ static inline Float rectangle_density(
     return pick(active & is_wide(seen) & (by_area > 0.0f), chance / seen.solid, by_area);
 }
 #endif
+
+#if SPHERES
+/// The same for the point `p` of a sphere, where its normal is `ng`.
+static inline Float sphere_density(
+    __global const Light *lights, Mask active, UInt light, Vec3 from, Vec3 p, Vec3 ng, Float by_area)
+{
+    active &= (GATHER_U(lights, light, flags) & LIGHT_SPHERE) != 0u;
+    if (!any_lane(active))
+        return by_area;
+    const Sphere sphere = fetch_sphere(lights, light);
+    const Vec3 outward = sub(p, sphere.center);
+    const Float r = max(sqrt(dot3(outward, outward)), 1e-30f);
+    const Vec3 n = scale(outward, 1.0f / r);
+    const Float density = density_around(see_sphere(sphere, from), n);
+    return pick(active, by_area * (GATHER(lights, light, area) / area_along(density, n, r, ng)), by_area);
+}
+#endif
 #endif
 
 // What choosing a light takes beside the table.
@@ -419,9 +437,9 @@ LARGE_FUNCTION LightSample sample_light(
                              GATHER(lights, light, e1[2]));
         const Vec3 e2 = vec3(GATHER(lights, light, e2[0]), GATHER(lights, light, e2[1]),
                              GATHER(lights, light, e2[2]));
-        const Vec3 ng = vec3(GATHER(lights, light, direction[0]), GATHER(lights, light, direction[1]),
-                             GATHER(lights, light, direction[2]));
-        const Float area = GATHER(lights, light, area);
+        Vec3 ng = vec3(GATHER(lights, light, direction[0]), GATHER(lights, light, direction[1]),
+                       GATHER(lights, light, direction[2]));
+        Float area = GATHER(lights, light, area);
         // Not even the boxes of the light and of its neighbours: to go down to one of 2^17 takes twice the time
         // of a sample.  21 u of both ends' coordinates for these (`geometry.h`), 4 u for the point.
         const Float reach = max(fabs(origin.x), max(fabs(origin.y), fabs(origin.z)));
@@ -449,6 +467,19 @@ LARGE_FUNCTION LightSample sample_light(
         }
 #endif
         Vec3 q = add_scaled(add_scaled(p0, e1, b1), e2, b2);
+#if SPHERES
+        const Mask round = on_triangle & ((flags & LIGHT_SPHERE) != 0u);
+        if (any_lane(round)) {
+            const Sphere sphere = fetch_sphere(lights, light);
+            const SeenSphere seen = see_sphere(sphere, origin);
+            const Vec3 n = draw_around(seen, u1, u2);
+            Vec3 face;
+            const Float r = face_along(sphere, n, &face);
+            q = pick_v(round, add_scaled(sphere.center, n, r), q);
+            ng = pick_v(round, face, ng);
+            area = pick(round, area_along(density_around(seen, n), n, r, face), area);
+        }
+#endif
         q = add_scaled(q, ng, pick(dot3(ng, sub(origin, q)) >= 0.0f, away, -away));
         const Vec3 toward = sub(q, origin);
         const Vec3 wi = normalize3(toward);

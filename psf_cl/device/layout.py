@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
+from psf_cl.scene import primitives
 from psf_cl.scene.model import LUMINANCE
 
 
@@ -389,19 +390,19 @@ LIGHT = Record(
     uint triangle - index, for LIGHT_TRIANGLE
     float pmf - chance to be picked
     float keep - alias table: chance that the slot keeps its own index
-    float position[3] - world, m; of a triangle the first corner
+    float position[3] - world, m; of a triangle the first corner, of a sphere the center
     uint other - alias table: the index otherwise
-    float direction[3] - unit, the way the light travels; of a triangle the normal of its front
+    float direction[3] - unit, the way of its light; of a triangle the front's normal, of a sphere y
     float range - m, inf for none
     float intensity[3] - candela, lux, or a triangle's radiance
     float cos_outer - of the cone
-    float e1[3] - of a triangle, second corner minus first
+    float e1[3] - of a triangle, second corner minus first; of a sphere its x axis, m
     float spot_scale - 1 / (cos inner - cos outer), floored
-    float e2[3] - of a triangle, third corner minus first
+    float e2[3] - of a triangle, third corner minus first; of a sphere its z axis, m
     float area - m^2, of a triangle
     float offset - of a triangle, as Surface.offset
     uint emission_texture - index, NO_TEXTURE for none
-    uint flags - of the material; LIGHT_RECTANGLE
+    uint flags - of the material; LIGHT_RECTANGLE or LIGHT_SPHERE
     float power - candela along its brightest direction, or lux from infinitely far
     float pad[4] - fills the record
     """),
@@ -1071,6 +1072,7 @@ CONSTANTS = (
     ("TEXTURE_NEAREST", 16, ""),
     ("TEXTURE_SRGB", 32, ""),
     ("LIGHT_RECTANGLE", 256, "the light is two triangles: e1 and e2 are edges of a rectangle"),
+    ("LIGHT_SPHERE", 512, "the light is a sphere: many triangles"),
     ("LIGHT_TRIANGLE", 0, ""),
     ("LIGHT_ENVIRONMENT", 1, ""),
     ("LIGHT_POINT", 2, ""),
@@ -1083,6 +1085,8 @@ CONSTANTS = (
     ("SAMPLER_RANDOM", 1, ""),
     ("PAIR_VERTEX", 2, "first pair of random numbers of the first vertex"),
     ("VERTEX_PAIRS", 4, "pairs of each vertex"),
+    ("SPHERE_COLUMNS", primitives.SPHERE_COLUMNS, "of faces of a light that is a sphere"),
+    ("SPHERE_ROWS", primitives.SPHERE_ROWS, ""),
     ("STRIP_ROWS", 4, "rows of pixels that the queue takes column by column"),
     ("STATUS_IDLE", 0, "the slot has no path yet"),
     ("STATUS_WAITING", 0x40000000, "it holds a sample whose pass may not start yet"),

@@ -121,6 +121,7 @@ def plan(context: Context) -> StageSpec | None:
             "VERTEX_COLORS",
             "AREA_LIGHTS",
             "RECTANGLES",
+            "SPHERES",
             "PUNCTUAL_LIGHTS",
             "ENVIRONMENT",
             "ALPHA",

@@ -46,6 +46,7 @@ def plan(context: Context) -> StageSpec:
             "LAYERS",
             "AREA_LIGHTS",
             "RECTANGLES",
+            "SPHERES",
             "PUNCTUAL_LIGHTS",
             "ENVIRONMENT",
             "ALPHA",
@@ -78,6 +79,7 @@ def _kernel(context: Context) -> KernelSpec:
         shadow += ("light_share",)
     if context.features["BASE"].value == 2 and shadow:
         shadow += ("base_light",)
+    seen_from = any(context.on(name) for name in ("LIGHT_SAMPLING", "RECTANGLES", "SPHERES"))
     chosen: tuple[str, ...] = ("light_normal",) if context.on("LIGHT_SAMPLING") else ()
     if context.features["LIGHT_SAMPLING"].value >= 2:
         chosen += ("particle_row",)
@@ -122,7 +124,7 @@ def _kernel(context: Context) -> KernelSpec:
     feature_bytes += 16 if context.on("AOV_LIGHTS") else 0
     return KernelSpec(
         "shade_paths",
-        reads=(*walk, *(("origin",) if chosen else ()), "hit", "sample", "pixel", "seed"),
+        reads=(*walk, *(("origin",) if seen_from else ()), "hit", "sample", "pixel", "seed"),
         writes=(*walk, "origin", *shadow),
         record_bytes=sum(record.dtype.itemsize for record in records) + feature_bytes + guide_bytes,
         hash_accesses=sum(map(context.on, ("GUIDE", "CACHE", "MATERIAL_CELLS"))),
