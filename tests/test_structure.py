@@ -23,7 +23,7 @@ ROWS = [
     | {"checkpoint", "learned"},
     {"scene", "measure"},
     {"device"},
-    {"stages", "few", "tables", "instancing", "motion", "mover"},
+    {"stages", "few", "tables", "whole_lights", "instancing", "motion", "mover"},
     {"chains", "plan", "scheduler"},
     {"renderer"},
     {"cli"},
