@@ -421,8 +421,8 @@ def test_a_sky_beyond_float32_is_limited_and_told(device, folder, capfd):
     assert "environment.scale" in refused(["render", "a.toml", *arguments], capfd, folder)
 
 
-@pytest.mark.parametrize("kind", ["exr", "hdr", "png", "jpg", "checkpoint"])
-def test_damaged_images_and_checkpoints_load_soundly_or_are_refused(monkeypatch, folder, kind):
+@pytest.mark.parametrize("kind", ["exr", "hdr", "png", "jpg", "checkpoint", "cache"])
+def test_damaged_images_and_states_load_soundly_or_are_refused(monkeypatch, folder, kind):
     monkeypatch.syspath_prepend(Path(__file__).resolve().parents[1] / "tools")
     fuzz = importlib.import_module("fuzz_readers")
     files = fuzz.corpus(kind, [])
@@ -433,10 +433,12 @@ def test_damaged_images_and_checkpoints_load_soundly_or_are_refused(monkeypatch,
     for seed in range(40):
         data = fuzz.file_of(kind, files, seed)
         fuzz.try_file(kind, data, folder)
-        path = folder / "a.toml" if kind in fuzz.USED_BY else folder / "a.checkpoint"
+        path = folder / "a.toml" if kind in fuzz.USED_BY else folder / f"a.{kind}"
         try:
             if kind == "checkpoint":
                 fuzz.read_checkpoint(path, fuzz.IDENTITY, fuzz.BUFFERS)
+            elif kind == "cache":
+                fuzz.read_learned(path, fuzz.IDENTITY, fuzz.TABLES)
             else:
                 fuzz.load_scene(path)
         except InputError:

@@ -1,4 +1,4 @@
-"""Feed readers with damaged files: scenes, images, checkpoints load soundly or are refused.
+"""Feed readers with damaged files: scenes, images, saved renders load soundly or are refused.
 
     python tools/fuzz_readers.py gltf --seconds 600
     python tools/fuzz_readers.py obj --seed 81234 --count 1     # once more what seed 81234 found
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import base64
+import hashlib
 import io
 import json
 import multiprocessing
@@ -34,8 +35,10 @@ import PIL.Image
 
 from psf_cl import tables
 from psf_cl.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from psf_cl.device import layout
 from psf_cl.errors import InputError
 from psf_cl.image import Image, write_exr
+from psf_cl.learned import MOST_VISITS, read_learned, write_learned
 from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import TEXTURE_FIELDS, Scene
 
@@ -49,7 +52,10 @@ MEMORY = 6 << 30
 #: Files of a corpus up to this size are used, bytes: larger ones are slow to damage.
 LARGEST = 1 << 17
 
-KINDS = ("gltf", "obj", "ply", "toml", "exr", "hdr", "png", "jpg", "checkpoint")
+KINDS = ("gltf", "obj", "ply", "toml", "exr", "hdr", "png", "jpg", "checkpoint", "cache")
+
+#: Files that end with a digest of what is in them.
+SIGNED = ("checkpoint", "cache")
 
 #: What numbers are replaced by.
 NUMBERS = (
@@ -473,6 +479,34 @@ def a_checkpoint() -> bytes:
         return path.read_bytes()
 
 
+TABLES = {
+    "guide_keys": (np.dtype("<u4"), 8),
+    "guide_sums": (layout.GUIDE_SUM.dtype, 8),
+    "cache_sums": (layout.CACHE_SUM.dtype, 8),
+    "cache_cells": (layout.CACHE_CELL.dtype, 8),
+}
+
+
+def a_cache() -> bytes:
+    """Return a small file of what was learned."""
+    chance = np.random.default_rng(1)
+    tables = {
+        name: chance.integers(0, 100, count * dtype.itemsize // 4, np.uint32).view(dtype)
+        for name, (dtype, count) in TABLES.items()
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a"
+        write_learned(path, IDENTITY, tables)
+        return path.read_bytes()
+
+
+def signed(data: bytes) -> bytes:
+    """Return a file of arrays, damaged, with the digest that it should have."""
+    first = data.find(b"\n") + 1
+    body = data[first:-32]
+    return data[:first] + body + hashlib.sha256(body).digest()
+
+
 def corpus(kind: str, folders: list[Path]) -> list[bytes]:
     """Return the files to damage; an OBJ file carries its MTL after a NUL."""
     own: list[bytes] = {
@@ -481,6 +515,7 @@ def corpus(kind: str, folders: list[Path]) -> list[bytes]:
         "png": lambda: pictures(kind),
         "jpg": lambda: pictures(kind),
         "checkpoint": lambda: [a_checkpoint()],
+        "cache": lambda: [a_cache()],
         "gltf": lambda: [rich_gltf()],
         "obj": lambda: [RICH_OBJ + b"\0" + RICH_MTL],
         "ply": lambda: [RICH_PLY, binary_ply(False), binary_ply(True)],
@@ -517,7 +552,8 @@ def damaged(kind: str, data: bytes, chance: random.Random) -> bytes:
     changes = (change_words, change_words, change_lines, change_bytes)
     for _ in range(chance.choice([1, 1, 2, 3, 8])):
         data = chance.choice(changes)(data, chance)
-    return data
+    # Whoever makes a file on purpose knows how to sign it.
+    return signed(data) if kind in SIGNED and chance.random() < 0.7 else data
 
 
 def change_json(document: Any, chance: random.Random) -> None:
@@ -617,6 +653,14 @@ def check_scene(scene: Scene) -> None:
         tables.material_table(scene.materials)
 
 
+def check_tables(tables: dict[str, np.ndarray]) -> None:
+    """Assert that what was learned is finite and has room for more."""
+    for name in ("guide_sums", "cache_sums"):
+        assert tables[name]["count"].max() <= MOST_VISITS, "visits"
+        assert (tables[name]["high"] < 1 << 31).all(), "sums"
+    assert np.isfinite(tables["cache_cells"].view(np.float32)).all(), "cells"
+
+
 #: What makes a scene that reads an image.
 TEXTURED = '[materials.m]\nbase_color_texture = "{name}"\n'
 LIT = '[environment]\nimage = "{name}"\n[materials.m]\n'
@@ -645,6 +689,8 @@ def try_file(kind: str, data: bytes, folder: Path) -> None:
             warnings.simplefilter("error")
             if kind == "checkpoint":
                 read_checkpoint(path, IDENTITY, BUFFERS)
+            elif kind == "cache":
+                check_tables(read_learned(path, IDENTITY, TABLES)[0])
             else:
                 check_scene(load_scene(path, size=(16, 16)))
             if kind in ("gltf", "toml"):
