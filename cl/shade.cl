@@ -79,6 +79,12 @@ LARGE_FUNCTION void store_seen(
 }
 #endif
 
+// Of what a direction reflects, the least part by the base for which its light goes to a cell of that base.
+#define LEAST_SHARE 0.5f
+
+// Sharper reflections change within a cell.
+#define LEAST_CELL_ALPHA 0.16f
+
 #if CELLS && BASE == 2
 /// Hand in what part of all that comes from beyond the first surface its base reflects.
 static inline void store_base_share(
@@ -537,7 +543,7 @@ kernel void shade_paths(
     const Mask chosen = goes_on & (vertex == 0u) & (max3(gate) > 0.0f)
                         & wants_cell(params, depth, length, FIELD(path, PATH_HIT_T), pdf_bsdf);
     if (any_lane(chosen)) {
-        store_cell_vertices(params, vertices, chosen, sample, pixel, s.p, s.ng, gate, length);
+        store_cell_vertices(params, vertices, chosen, sample, pixel, s.p, pack_unit(s.ng), gate, length);
         put_u(path, PATH_VERTEX, pick_u(chosen, depth + 1u, get_u(path, PATH_VERTEX)));
     }
 #endif
@@ -750,8 +756,26 @@ kernel void shade_paths(
     put_u(path, PATH_GUIDE, guide_part(guide, part, u_lobe < chances.diffuse));
 #endif
 #if CELLS == 2
-    share = pick_v(chosen, base_share(b, chances, base, drawn, f), share);
+    const Vec3 by_base = base_share(b, chances, base, drawn, f);
+    share = pick_v(chosen, by_base, share);
+    const Mask by_gloss = max3(by_base) < LEAST_SHARE;
+    // Of a path that goes on by a coat the base's cell would get little: a later vertex may share its light.
+    const Mask gives_up = chosen & by_gloss & (Mask)(params->filter_direct ? 0 : -1);
+    UInt shared_at = pick_u(gives_up, (UInt)(0u), get_u(path, PATH_VERTEX));
+#if CELL_LAYERS
+    const Mask wide = goes_on & by_gloss & !delta & (drawn.z > 0.0f) & (b.alpha >= LEAST_CELL_ALPHA);
+    const Mask glossy = wide & (vertex == 0u) & wants_cell(params, depth, length, FIELD(path, PATH_HIT_T), pdf_bsdf);
+    if (any_lane(glossy)) {
+        const UInt turn = mix_bits(mix_bits(get_u(path, PATH_SEED) + depth * 0xc2b2ae35u) + sample);
+        const UInt tagged = with_direction(pack_unit(s.ng), params->cell_directions, wo, turn);
+        const Vec3 tint = add(scale(b.base_color, b.metallic), vec3_all(1.0f - b.metallic));
+        store_cell_vertices(params, vertices, glossy, sample, pixel, s.p, tagged, mul(beta, tint), length);
+        share = pick_v(glossy, sub(vec3_all((Float)(1.0f)), by_base), share);
+        shared_at = pick_u(glossy, (depth + 1u) | VERTEX_GLOSSY, shared_at);
+    }
+#endif
     put_v(path, PATH_SHARE_R, share);
+    put_u(path, PATH_VERTEX, shared_at);
 #endif
 #if BASE == 2
     base_part = pick_v(camera_ray, base_share(b, chances, base, drawn, f), base_part);

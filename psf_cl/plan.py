@@ -612,6 +612,7 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             f"termination is {settings.termination}",
         ),
         "CELLS": _cells(settings, glossy),
+        "CELL_LAYERS": _cell_layers(settings, glossy),
         "SPARSE": _sparse(settings),
         "WALLS": _walls(settings),
         "AOV_CELLS": _aov_cells(settings, outputs),
@@ -773,6 +774,19 @@ def _sparse(settings: Settings) -> Feature:
     return Feature(1, f"cell_min_count asks for {settings.cell_min_count} samples in a cell")
 
 
+def _cell_layers(settings: Settings, glossy: bool) -> Feature:
+    """Return whether what coats and metals reflect has cells of its own."""
+    if settings.path_filter != "hash_grid":
+        return Feature(0, f"path_filter is {settings.path_filter}")
+    if not settings.cell_layers:
+        return Feature(0, "cell_layers is false: what coats and metals reflect is not shared")
+    if not glossy:
+        return Feature(0, "every material is matt")
+    if settings.screen_filter != "off":
+        return Feature(0, "screen_filter averages diffuse light alone")
+    return Feature(1, "cell_layers shares what coats and metals reflect, apart from diffuse light")
+
+
 def _walls(settings: Settings) -> Feature:
     """Return whether walls inside cells keep light apart."""
     if settings.path_filter != "hash_grid":
@@ -882,6 +896,8 @@ def _all_on(features: dict[str, Feature]) -> dict[str, Feature]:
     full["AOV_GUIDE"] = features["AOV_GUIDE"]
     # Paths would end elsewhere.
     full["CACHE"] = features["CACHE"]
+    # Other light would be shared.
+    full["CELL_LAYERS"] = features["CELL_LAYERS"]
     # Means of texels would be read.
     full["MATERIAL_CELLS"] = features["MATERIAL_CELLS"]
     if features["METROPOLIS"].value:

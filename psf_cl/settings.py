@@ -137,7 +137,7 @@ class Settings:
         "hash grid (biased)",
     )
     material_cell_size: float = _number(
-        4.0, 1e-3, 1e6, doc="edge of a cell of material_cache, pixels"
+        16.0, 1e-3, 1e6, doc="edge of a cell of material_cache, pixels"
     )
     termination: str = _choice(
         "roulette",
@@ -209,6 +209,16 @@ class Settings:
     )
     cell_walls: bool = _switch(
         True, doc="keep light apart that a wall inside a cell separates: short rays look for it"
+    )
+    cell_layers: bool = _switch(
+        False, doc="share what coats and metals reflect too, apart from diffuse light"
+    )
+    cell_directions: int = _number(
+        0,
+        0,
+        16,
+        doc="parts of the sphere, a side of its square, that tell apart where paths come from "
+        "whose glossy light is shared; 0: from anywhere",
     )
     cell_shrink: bool = _switch(
         True, doc="make cells smaller from pass to pass: consistent; else the image stays blurred"

@@ -487,6 +487,7 @@ def test_plan_follows_the_options(all_features, capsys):
         "CACHE",
         "CELLS",
         "CELL_HISTORY",
+        "CELL_LAYERS",
         "FEW",
         "GUIDE",
         "INSTANCES",

@@ -169,6 +169,9 @@ JOBS = {
     ),
     "outputs": Job(everything, "psf", {"filter_restore": False}, tree=False, everything=True),
     "outputs of cells": Job(room, "psf", {"cell_min_count": 4}, outputs=OUTPUTS_OF_CELLS),
+    "layers of cells": Job(
+        everything, "psf", {"cell_layers": True, "cell_directions": 4}, tree=False
+    ),
     "screen filter": Job(room, "pt", {"screen_filter": "path_space"}, tree=False),
     "splits": Job(room, "pt", {"splits": 2, "sampler": "random", "direct_sampling": "bsdf"}),
     "virtual lights": Job(

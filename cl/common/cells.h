@@ -32,6 +32,30 @@ typedef struct {
     UInt key;
 } CellKey;
 
+// What cells of gloss tell apart beside the place lies in the last bits of both halves of a packed normal.
+#define DIRECTION_BITS 0x000f000fu
+
+/// The packed normal `ng` with the part of the octahedron's square, of `side` x `side`, that `wo` is in; `random`
+/// blurs the borders of the parts.
+static inline UInt with_direction(UInt ng, uint side, Vec3 wo, UInt random)
+{
+    const UInt packed = pack_unit(wo);
+    const Float step = (Float)((float)side / 65535.0f);
+    const Float last = (Float)((float)max(side, 1u) - 1.0f);
+    const Float x = to_float(packed & 0xffffu) * step + unit_float(random) - 0.5f;
+    const Float y = to_float(packed >> 16) * step + unit_float(mix_bits(random)) - 0.5f;
+    const UInt i = to_uint(clamp(x, (Float)(0.0f), last));
+    const UInt j = to_uint(clamp(y, (Float)(0.0f), last));
+    return (ng & ~DIRECTION_BITS) | i | (j << 16);
+}
+
+/// What tells the cells of gloss of one place apart, and from those of diffuse light; never 0.
+static inline UInt direction_of(UInt ng)
+{
+    const UInt bits = ng & DIRECTION_BITS;
+    return (1u + (bits & 15u) + (bits >> 12)) * 0x9e3779b1u;
+}
+
 // Purposes of random numbers.
 #define CELL_STORE 0u
 #define CELL_LOOK_UP 0x9e3779b9u

@@ -108,6 +108,9 @@
 #ifndef MATERIAL_CELLS
 #error "MATERIAL_CELLS must be 0 or 1 (later vertices fetch what textures give once a cell)"
 #endif
+#ifndef CELL_LAYERS
+#error "CELL_LAYERS must be 0 or 1 (what coats and metals reflect has cells of its own)"
+#endif
 #ifndef AOV_BOUNCES
 #error "AOV_BOUNCES must be 0 or 1"
 #endif

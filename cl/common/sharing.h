@@ -56,7 +56,7 @@ static inline UInt near_bit(
                   VERTEX_NEAR | (cube_face(ng) << VERTEX_FACE_SHIFT), (UInt)(0u));
 }
 
-/// Hand in the vertices of the lanes in `chosen`.
+/// Hand in the vertices of the lanes in `chosen`; `ng` is packed.
 static inline void store_cell_vertices(
     __global const Params *params,
     __global CellVertex *vertices,
@@ -64,7 +64,7 @@ static inline void store_cell_vertices(
     UInt sample,
     UInt pixel,
     Vec3 p,
-    Vec3 ng,
+    UInt ng,
     Vec3 gate,
     Float length)
 {
@@ -74,7 +74,7 @@ static inline void store_cell_vertices(
     float lane_value[7][W];
     store_lanes_u(sample & (params->ring - 1u), lane_sample);
     store_lanes_u(pixel, lane_pixel);
-    store_lanes_u(pack_unit(ng), lane_ng);
+    store_lanes_u(ng, lane_ng);
     const Float values[7] = {p.x, p.y, p.z, gate.x, gate.y, gate.z, length};
     for (uint c = 0; c < 7; ++c)
         store_lanes(values[c], lane_value[c]);

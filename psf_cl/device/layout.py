@@ -116,6 +116,7 @@ PARAMS = Record(
     uint cell_slots - of the table of cells of one pass, a power of two
     uint cell_flags - CELL_JITTER, CELL_NEAR, CELL_IDENTITY
     float cell_width - edge of a cell in the first pass, m per m of the path
+    uint cell_directions - parts of directions that cells of gloss tell apart, a side
     float cell_shrink - exponent of the number of the pass in the edge of a cell
     float cell_steps - fixed-point steps of a sum of radiance per unit, a power of two
     float cell_limit - radiance from which a sample is too large for the sums
@@ -1102,6 +1103,7 @@ CONSTANTS = (
     ("VERTEX_REJECTED", 0x40000000, "set if what was gathered is too large for a cell"),
     ("VERTEX_WALL_SHIFT", 24, "first bit of what separates the vertex from where it is stored"),
     ("VERTEX_WALL_MASK", 7, "of that, shifted: 0 nothing, or 1 + the side that a wall faces"),
+    ("VERTEX_GLOSSY", 0x200000, "set if what is shared is what coats and metals reflect there"),
     ("VERTEX_MASK", 0x1FFFFF, "1 + depth"),
     ("CELL_JITTER", 1, "points are moved before they are told apart by cells"),
     ("CELL_NEAR", 4, "samples of light from near have cells of their own"),

@@ -58,6 +58,7 @@ def plan(context: Context) -> StageSpec:
             "SEEN",
             "VIRTUAL_LIGHTS",
             *POOL_FLAGS,
+            "CELL_LAYERS",
             "METROPOLIS",
         ),
         kernels=(_kernel(context),),
