@@ -12,18 +12,15 @@
 #include "common/layout.h"
 #include "common/pixels.h"
 
-// How much of a squared mean counts as noise, in variances of it.
-#define NOISE 2.0f
-
 static inline Vec3 gather_lost(__global const Lost *lost, UInt pixel)
 {
     return vec3(GATHER(lost, pixel, rgb[0]), GATHER(lost, pixel, rgb[1]), GATHER(lost, pixel, rgb[2]));
 }
 
-/// Part of a mean that is not noise, of the square of its luminance and its variance.
-static inline Float sure_part(Float square, Float variance)
+/// Part of a mean that is not noise, of the square of its luminance and what of it counts as noise.
+static inline Float sure_part(Float square, Float noise)
 {
-    return max(square - NOISE * variance, (Float)(0.0f)) / max(square, (Float)(1e-37f));
+    return max(square - noise, (Float)(0.0f)) / max(square, (Float)(1e-37f));
 }
 
 /// Column and row of W pixels in the crop.
@@ -34,12 +31,12 @@ static inline void place_in_crop(__global const Params *params, UInt pixel, UInt
     *row -= params->crop_y;
 }
 
-/// Turn sums into means, with their variances in `difference`, and take the picture from the film.  One
-/// work item a pixel.
+/// Turn sums into means, with what counts as noise of their squares in `difference`, and take the picture from the
+/// film.  One work item a pixel.
 ///
 /// The noise shows in the difference between two halves of the samples; `tilt` is what one half has more of
 /// all, and 1 where nothing can be told.  Of few samples the halves often look too much alike, for bright ones
-/// are rare: their noise is taken for larger.
+/// are rare: their noise is taken for larger.  `caution` variances count as noise.
 ///
 /// reads   film, film_lost
 /// writes  unrestored, restored
@@ -49,7 +46,8 @@ kernel void take_lost(
     __global const Lost *film_lost,
     __global Lost *unrestored,
     __global float *restored,
-    const float tilt)
+    const float tilt,
+    const float caution)
 {
     const uint pixel = get_global_id(0);
     if (pixel >= params->pixel_count)
@@ -67,7 +65,7 @@ kernel void take_lost(
     const float apart = film_lost[pixel].difference - film_lost[params->pixel_count + pixel].difference;
     const float difference = apart / count - tilt * mean;
     const float variance = difference * difference / max(1.0f - tilt * tilt, 1e-6f);
-    unrestored[pixel].difference = variance * (1.0f + 4.0f / max(count - 1.0f, 1.0f));
+    unrestored[pixel].difference = caution * variance * (1.0f + 4.0f / max(count - 1.0f, 1.0f));
 }
 
 /// Sum over the pixels of a row, or `down` a column, at most `radius` away; return the sum of variances.

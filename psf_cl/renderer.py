@@ -636,9 +636,13 @@ class Renderer:
     def _restored(self, counters: np.ndarray) -> np.ndarray:
         """Return the image with what averages per cell lost, ``(h, w, 3)``."""
         passes = int(counters[layout.COUNTER_INDEX["film_pass"]]) - self.scheduler.first
-        self.restore_launches[0][0].set(tilt=restore.tilt(passes, self.settings.splits))
-        for launch, items in self.restore_launches:
-            launch(items, film.GROUP)
+        take, pixels = self.restore_launches["take"][0]
+        tilt = restore.tilt(passes, self.settings.splits)
+        take.set(tilt=tilt, caution=restore.caution(passes))
+        take(pixels, film.GROUP)
+        for step in (*restore.radii(passes), "pixels"):
+            for launch, items in self.restore_launches[step]:
+                launch(items, film.GROUP)
         return self._in_rows(self.device.read(self.buffers["restored"]).reshape(-1, 4)[:, :3])
 
     def settle(self) -> None:
@@ -1379,7 +1383,7 @@ class Renderer:
         self.add_unfiltered = program.bind_planned("add_unfiltered", self.buffers)
 
     def _bind_restore(self, program: Program | None) -> None:
-        self.restore_launches: list[tuple[Launch, int]] = []
+        self.restore_launches: dict[str | int, list[tuple[Launch, int]]] = {}
         if program is None:
             return
         names = ("params", "film", "film_lost", "unrestored", "rows", "restored")
@@ -1388,17 +1392,23 @@ class Renderer:
         items = -(-pixels // self.plan.traits.lanes)
         state = {"params": params, "unrestored": unrestored}
         take = program.bind(
-            "take_lost", film=sums, film_lost=lost, restored=restored, tilt=1.0, **state
+            "take_lost",
+            film=sums,
+            film_lost=lost,
+            restored=restored,
+            tilt=1.0,
+            caution=2.0,
+            **state,
         )
-        self.restore_launches.append((take, pixels))
+        self.restore_launches["take"] = [(take, pixels)]
         for radius in restore.RADII:
             add_up = program.bind("sum_rows", rows=rows, radius=radius, **state)
             add = program.bind(
                 "restore_windows", rows=rows, restored=restored, radius=radius, **state
             )
-            self.restore_launches += [(add_up, items), (add, items)]
+            self.restore_launches[radius] = [(add_up, items), (add, items)]
         last = program.bind("restore_pixels", restored=restored, **state)
-        self.restore_launches.append((last, items))
+        self.restore_launches["pixels"] = [(last, items)]
 
     def _bind_chains(self, program: Program | None) -> None:
         self.splat_launches: list[Launch] = []

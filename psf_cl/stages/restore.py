@@ -7,8 +7,24 @@ import numpy as np
 from psf_cl.device import layout
 from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
 
-#: Pixels to each side of the windows in which it is looked for, one after the other.
-RADII = (8, 2)
+#: Pixels to each side of the windows in which it is looked for, one after the other: of few passes
+#: nothing shows in the ones between.
+RADII_OF_FEW, RADII = (8, 2), (8, 4, 2, 1)
+MANY_PASSES = 16
+
+
+def radii(passes: int) -> tuple[int, ...]:
+    """Return the windows of so many passes."""
+    return RADII if passes >= MANY_PASSES else RADII_OF_FEW
+
+
+def caution(passes: int) -> float:
+    """Return how much of a squared mean counts as noise, in variances of it.
+
+    One is right where means are normal (James, Stein 1961), which those of few samples are not: two
+    up to 32 passes, ever less from there.
+    """
+    return 1.0 + min(1.0, 32.0 / max(passes, 1))
 
 
 def tilt(passes: int, splits: int = 1) -> float:
