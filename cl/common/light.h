@@ -412,7 +412,9 @@ LARGE_FUNCTION LightSample sample_light(
     const Float pmf = choice.pmf;
     const UInt kind = GATHER_U(lights, light, kind);
 #if PHOTON_POINTS
-    const Mask stored = choice.stored & (kind == LIGHT_TRIANGLE);
+    // Of a ball other numbers stand for other points from each place that sees it.
+    const Mask stored = choice.stored & (kind == LIGHT_TRIANGLE)
+                        & ((GATHER_U(lights, light, flags) & LIGHT_SPHERE) == 0u);
     Float stored1;
     Float stored2;
     light_point(choice.point, &stored1, &stored2);
