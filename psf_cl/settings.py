@@ -371,11 +371,10 @@ def check_together(settings: Settings) -> None:
             "settings: termination=cache with a path_filter needs cache_trace=0, for averages take "
             f"no negative light; got {settings.cache_trace}"
         )
-    if settings.light_sampling == "photon_origin" and settings.area_sampling != "area":
+    if settings.light_sampling == "photon_origin" and settings.area_sampling == "solid_angle":
         # Densities of points by solid angle are not those that photons start with.
         raise InputError(
-            "settings: light_sampling=photon_origin needs area_sampling=area; "
-            f"got {settings.area_sampling}"
+            "settings: light_sampling=photon_origin goes with any area_sampling but solid_angle"
         )
     if settings.indirect_light == "virtual_lights":
         for key, value in VIRTUAL_LIGHTS_NEED.items():
