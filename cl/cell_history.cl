@@ -112,14 +112,14 @@ static inline void blend_cells(
     const Mask seen = fresh > 0.0f;
     const Float inverse = 1.0f / max(fresh, 1.0f);
     const Vec3 rgb = scale(sum, inverse);
-    const Float level = luminance(known);
-    const Share share = share_of_frame(params, level, count, square, GATHER(cells, at, change), fresh);
+    const Float scatter = scatter_of(luminance(known), square);
+    const Share share = share_of_frame(params, count, scatter, GATHER(cells, at, change), fresh);
     const Vec3 mean = pick_v(seen, add_scaled(scale(known, 1.0f - share.alpha), rgb, share.alpha), known);
     const Float brightness = luminance(rgb);
     const Float mean_square =
         pick(seen, (1.0f - share.alpha) * square + share.alpha * brightness * brightness, square);
     // What nobody sees may have changed as much as anything.
-    const Float worth = worth_of(level, count, square, (Float)(largest), count / max(frames, 1e-6f));
+    const Float worth = worth_of(scatter, count, (Float)(largest), count / max(frames, 1e-6f));
     const Float kept = pick(seen, share.count - fresh, worth);
     const Float left = frames * (kept / max(count, 1e-6f));
     const Float values[6] = {mean.x, mean.y, mean.z, pick(seen, share.count, worth), mean_square,

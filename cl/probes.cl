@@ -18,6 +18,7 @@
 #include "common/trace.h"
 #include "common/light.h"
 #include "common/cell_history.h"
+#include "common/history.h"
 
 // What both kernels that trace need of the scene.
 #if SMOOTH
@@ -248,7 +249,7 @@ kernel void place_probes(SCENE_PARAMETERS CHOICE_PARAMETERS, __global Probe *pro
 #define DOUBT 2.0f
 
 // A change of all light of which so much is left beyond doubt is one.
-#define CLEAR 0.5f
+#define CLEAR 0.75f
 
 // A relative difference that may be rounding.
 #define DEAD_BAND 0.02f
@@ -276,14 +277,40 @@ static inline float change_of(Pool pool)
     return fabs(pool.difference) == pool.larger && change > CLEAR ? 1.0f : change;
 }
 
-/// Find how much light has changed around each probe: 0 not at all, 1 altogether.  One work item a probe.
+/// How far frames scatter around a tile: their variance, relative to the square of the light.
+///
+/// Of pixels by themselves it would be too small wherever rare bright paths have not been found yet, and
+/// those would forget first.
+static inline float scatter_around(__global const Params *params, __global const History *history, int column, int row)
+{
+    const int edge = PROBE_TILE;
+    float variance = 0.0f;
+    float square = 0.0f;
+    for (int y = max((row - 1) * edge, 0); y < min((row + 2) * edge, (int)params->crop_height); ++y)
+        for (int x = max((column - 1) * edge, 0); x < min((column + 2) * edge, (int)params->crop_width); ++x) {
+            __global const History *pixel = &history[pixel_entry_of(params, (uint)x, (uint)y)];
+            const float level = 0.2126f * pixel->rgb[0] + 0.7152f * pixel->rgb[1] + 0.0722f * pixel->rgb[2];
+            if (pixel->count > 0.0f && level < 1e18f) {
+                variance += max(pixel->square - level * level, 0.0f);
+                square += level * level;
+            }
+        }
+    return variance / max(square, 1e-30f);
+}
+
+/// Find how much light has changed around each probe, 0 not at all, 1 altogether, and how far frames scatter
+/// there.  One work item a probe.
 ///
 /// The largest square of tiles has the least doubt, but shadows that move take away on one side of it what
 /// they give on the other: the largest change of those around a tile counts.
 ///
-/// reads   probes
+/// reads   probes, history
 /// writes  changes
-kernel void pool_probes(__global const Params *params, __global const Probe *probes, __global float *changes)
+kernel void pool_probes(
+    __global const Params *params,
+    __global const Probe *probes,
+    __global const History *history,
+    __global float *changes)
 {
     const int columns = (int)probe_columns(params);
     const int rows = (int)probe_rows(params);
@@ -309,14 +336,24 @@ kernel void pool_probes(__global const Params *params, __global const Probe *pro
                 shining += (float2)(fabs(value.w - value.z), max(value.z, value.w));
         }
     float change = part_of(shining.x, shining.y);
+    int brighter = 0;
     Pool pool = rings[0];
     for (uint ring = 1; ring <= POOLED; ++ring) {
         pool.difference += rings[ring].difference;
         pool.square += rings[ring].square;
         pool.larger += rings[ring].larger;
-        change = max(change, change_of(pool));
+        const float its = change_of(pool);
+        brighter = its > change ? pool.difference > 0.0f : brighter;
+        change = max(change, its);
     }
-    changes[at] = change;
+    float scatter = 0.0f;
+    if (change > 0.0f) {
+        scatter = scatter_around(params, history, column, row);
+        // Light that came scatters as much as what was there: the frames to come are less worth than those before.
+        const float before = 1.0f - min(change, CERTAIN);
+        scatter = brighter ? scatter / (before * before) : scatter;
+    }
+    vstore2((float2)(change, scatter), at, changes);
 }
 
 #if CELL_HISTORY == 2
@@ -358,7 +395,7 @@ kernel void spread_changes(
     query.seen = MASK_ALL;
     query.near = (UInt)(0u);
     query.extra = (UInt)(0u);
-    const Float change = 1.0f + gather_words(changes, at);
+    const Float change = 1.0f + gather_words(changes, 2u * at);
     float lane_change[W];
     store_lanes(change, lane_change);
     for (uint level = 0; level < 3; ++level) {

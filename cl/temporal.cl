@@ -12,13 +12,16 @@
 #include "common/view.h"
 
 #if TEMPORAL == 2
-/// How much the light has changed of what was seen in a column and a row of the frame before: 0 to 1.
-static inline Float change_at(__global const Params *params, __global const float *changes, Float column, Float row)
+/// How much the light has changed of what was seen in a column and a row of the frame before, 0 to 1, and how
+/// far frames scatter around there.
+static inline Float change_at(
+    __global const Params *params, __global const float *changes, Float column, Float row, Float *scatter)
 {
     const Float x = clamp(column, (Float)(0.0f), (Float)((float)params->crop_width - 1.0f));
     const Float y = clamp(row, (Float)(0.0f), (Float)((float)params->crop_height - 1.0f));
     const UInt at = to_uint(y * (1.0f / PROBE_TILE)) * probe_columns(params) + to_uint(x * (1.0f / PROBE_TILE));
-    return gather_words(changes, at);
+    *scatter = gather_words(changes, 2u * at + 1u);
+    return gather_words(changes, 2u * at);
 }
 #endif
 
@@ -212,6 +215,7 @@ kernel void blend_history(
 #endif
     Float weights = (Float)(0.0f);
     Float change = (Float)(0.0f);
+    Float scatter = (Float)(0.0f);
     if ((params->history_flags & HISTORY_THERE) && params->temporal_rule != RULE_OFF) {
         UInt x;
         UInt y;
@@ -236,7 +240,7 @@ kernel void blend_history(
         const Mask same_view = params->history_flags & HISTORY_SAME_VIEW ? MASK_ALL : none;
 #if TEMPORAL == 2
         if (params->temporal_rule == RULE_ADAPTIVE)
-            change = change_at(params, changes, left, top);
+            change = change_at(params, changes, left, top, &scatter);
 #endif
         const Mask unmoved = same_view & (right == 0.0f) & (down == 0.0f);
         for (uint k = 0; k < 4; ++k) {
@@ -255,7 +259,7 @@ kernel void blend_history(
 #endif
     }
 
-    const Share share = share_of_frame(params, luminance(known.rgb), known.count, known.square, change, fresh);
+    const Share share = share_of_frame(params, known.count, scatter, change, fresh);
     const Float alpha = share.alpha;
     Float count = share.count;
     Vec3 mean = add_scaled(scale(known.rgb, 1.0f - alpha), rgb, alpha);

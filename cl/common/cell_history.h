@@ -75,7 +75,7 @@ static inline void take_known(
     const Float square = GATHER(kept_cells, at, square);
     const Mask there = found & (count > 0.0f);
     const Float fresh = max(count / max(frames, 1e-6f), 1.0f);
-    const Share share = share_of_frame(params, luminance(mean), count, square, change, fresh);
+    const Share share = share_of_frame(params, count, scatter_of(luminance(mean), square), change, fresh);
     // Pixels have weighed their own histories against the change; on top of that comes only what is certain.
     const Float certain = 1.0f - min(change * (1.0f / CERTAIN), 1.0f);
     const Float part = certain * (share.kept / pick(there, count, (Float)(1.0f)));

@@ -14,18 +14,28 @@
 #define PRIOR_VARIANCE 0.25f
 #define PRIOR_FRAMES 2.0f
 
+/// How often the square of the light of a history exceeds the variance of its frames, which is `scatter` times
+/// that square as far as frames have shown.
+static inline Float clearness_of(Float scatter, Float frames)
+{
+    return (frames + PRIOR_FRAMES) / max(frames * scatter + PRIOR_FRAMES * PRIOR_VARIANCE, 1e-30f);
+}
+
 /// Samples that a history is worth of which a part has changed: with N of variance v and a bias b, it errs as
 /// N / (1 + N b^2 / v) without bias.  All of them if nothing has changed.
-static inline Float worth_of(Float level, Float count, Float mean_square, Float change, Float fresh)
+static inline Float worth_of(Float scatter, Float count, Float change, Float fresh)
 {
     // A change of c of the brighter of both leaves at least 1 - c of it.
-    const Float bias = change * level / (1.0f - min(change, CERTAIN));
+    const Float bias = change / (1.0f - min(change, CERTAIN));
     const Float frames = count / max(fresh, 1.0f);
-    const Float spread = max(mean_square - level * level, 0.0f);
-    const Float variance =
-        (frames * spread + PRIOR_FRAMES * PRIOR_VARIANCE * level * level) / (frames + PRIOR_FRAMES);
-    const Float ratio = frames * bias * bias / max(variance, 1e-30f);
+    const Float ratio = frames * bias * bias * clearness_of(scatter, frames);
     return pick(change > 0.0f, count / (1.0f + ratio), count);
+}
+
+/// The variance of frames relative to the square of their mean.
+static inline Float scatter_of(Float level, Float mean_square)
+{
+    return max(mean_square - level * level, 0.0f) / max(level * level, 1e-30f);
 }
 
 /// What a frame adds.
@@ -35,13 +45,12 @@ typedef struct {
     Float kept;  // samples that what was known is worth in this frame
 } Share;
 
-/// The share of a frame of `fresh` samples in what was known: its luminance, samples, and mean square of the
-/// luminance of frames.
+/// The share of a frame of `fresh` samples in what was known: its samples, and how far frames scatter.
 static inline Share share_of_frame(
-    __global const Params *params, Float level, Float known, Float mean_square, Float change, Float fresh)
+    __global const Params *params, Float known, Float scatter, Float change, Float fresh)
 {
     const Mask is_known = known > 0.0f;
-    Float kept = pick(is_known, worth_of(level, known, mean_square, change, fresh), (Float)(0.0f));
+    Float kept = pick(is_known, worth_of(scatter, known, change, fresh), (Float)(0.0f));
     Float alpha = fresh / max(kept + fresh, 1.0f);
     Float count = kept + fresh;
     if (params->temporal_rule == RULE_EXPONENTIAL) {

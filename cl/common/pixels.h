@@ -20,6 +20,13 @@ static inline UInt pixel_entry(__global const Params *params, UInt column, UInt 
     return top * params->crop_width + column * rows + row - top;
 }
 
+/// The same for one pixel.
+static inline uint pixel_entry_of(__global const Params *params, uint column, uint row)
+{
+    const uint top = row - row % STRIP_ROWS;
+    return top * params->crop_width + column * min((uint)STRIP_ROWS, params->crop_height - top) + row - top;
+}
+
 /// Column and row on the film of entry `i` of the queue's order (tables.pixel_order).
 static inline void pixel_place(__global const Params *params, UInt i, UInt *x, UInt *y)
 {

@@ -49,7 +49,7 @@ def plan(context: Context) -> StageSpec | None:
         ),
         buffers=(
             BufferSpec("probes", layout.PROBE.dtype, probes, "paths that are traced again"),
-            BufferSpec("changes", np.dtype(np.float32), probes, "change of light around them"),
+            BufferSpec("changes", np.dtype(np.float32), 2 * probes, "of light around them"),
         ),
         traces=True,
         per_pass=True,
