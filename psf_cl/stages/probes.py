@@ -19,6 +19,7 @@ def plan(context: Context) -> StageSpec | None:
     if context.features["TEMPORAL"].value != 2:
         return None
     probes = count(*context.crop_size)
+    what = "change of light around them, and how far frames scatter"
     spreads = (KernelSpec("spread_changes"),) if context.on("CELL_HISTORY") else ()
     return StageSpec(
         "probes",
@@ -49,7 +50,7 @@ def plan(context: Context) -> StageSpec | None:
         ),
         buffers=(
             BufferSpec("probes", layout.PROBE.dtype, probes, "paths that are traced again"),
-            BufferSpec("changes", np.dtype(np.float32), 2 * probes, "of light around them"),
+            BufferSpec("changes", np.dtype(np.float32), 2 * probes, what),
         ),
         traces=True,
         per_pass=True,
