@@ -658,8 +658,8 @@ def _rectangles(scene: Scene, settings: Settings, connected: bool) -> Feature:
         return Feature(0, f"area_sampling is {settings.area_sampling}")
     count, _ = count_whole_lights(scene, "rectangles")
     if not count:
-        return Feature(0, "no rectangle that stands still and glows evenly")
-    return Feature(1, f"{count} lights are rectangles, sampled by the solid angle that they fill")
+        return Feature(0, "no rectangle or disk that stands still and glows evenly")
+    return Feature(1, f"{count} lights are flat, sampled by the solid angle that they fill")
 
 
 def _spheres(scene: Scene, settings: Settings, connected: bool) -> Feature:

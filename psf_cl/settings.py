@@ -122,8 +122,8 @@ class Settings:
         "auto",
         "area",
         "solid_angle",
-        doc="how points of lights are drawn: uniformly, or as spheres and rectangles are seen; "
-        "auto: spheres as they are seen",
+        doc="how points of lights are drawn: uniformly, or as balls, disks, rectangles are seen; "
+        "auto: balls as they are seen",
     )
     texture_level: str = _choice(
         "full",

@@ -1,8 +1,8 @@
-"""Which triangles are one light: rectangles and spheres that stand still and glow evenly."""
+"""Which triangles are one light: rectangles, disks and spheres that stand still and glow evenly."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -69,12 +69,13 @@ def find_whole_lights(
         shapes: what ``shape`` of the surfaces counts.
         surfaces: ``(m,)`` layout.SURFACE of all triangles.
         triangles: ``(n,)`` indices of those that emit, ascending.
-        kinds: which are wanted, of ``"rectangles"`` and ``"spheres"``.
+        kinds: which are wanted, of ``"rectangles"`` (disks too) and ``"spheres"``.
     """
     if lights_move(scene):
         return []
     found = _spheres(scene, shapes, surfaces, triangles) if "spheres" in kinds else []
     if "rectangles" in kinds:
+        found += _disks(scene, shapes, surfaces, triangles)
         free = np.ones(len(triangles), bool)
         for light in found:
             free[light.first : light.first + light.count] = False
@@ -88,32 +89,53 @@ def _spheres(
     scene: Scene, shapes: Sequence[Shape], surfaces: np.ndarray, triangles: np.ndarray
 ) -> list[WholeLight]:
     """Return the spheres of scene.primitives that are round in the world."""
-    shape_of = surfaces["shape"][triangles]
     spheres = []
-    for number, shape in enumerate(shapes):
-        if not is_round(scene, shape):
-            continue
-        first, end = np.searchsorted(shape_of, [number, number + 1])
-        if end - first != len(shape.mesh.triangles):
-            continue
-        x, y, z = shape.transform[:3, :3].T
-        center = shape.transform[:3, 3]
-        flag = layout.CONSTANT["LIGHT_SPHERE"]
-        axis = y / np.linalg.norm(y)
-        # Seen from afar a sphere is a disk with a quarter of its area.
-        spheres.append(WholeLight(int(first), int(end - first), flag, center, x, z, axis, 0.25))
+    for first, shape in _whole_shapes(shapes, surfaces, triangles):
+        if is_round(scene, shape):
+            x, y, z = shape.transform[:3, :3].T
+            center, axis = shape.transform[:3, 3], y / np.linalg.norm(y)
+            flag, count = layout.CONSTANT["LIGHT_SPHERE"], len(shape.mesh.triangles)
+            # Seen from afar a sphere is a disk with a quarter of its area.
+            spheres.append(WholeLight(first, count, flag, center, x, z, axis, 0.25))
     return spheres
+
+
+def _disks(
+    scene: Scene, shapes: Sequence[Shape], surfaces: np.ndarray, triangles: np.ndarray
+) -> list[WholeLight]:
+    """Return the disks of scene.primitives, and ellipses whose axes are the disk's."""
+    disks = []
+    for first, shape in _whole_shapes(shapes, surfaces, triangles):
+        x, _, z = shape.transform[:3, :3].T
+        lengths = np.linalg.norm(x) * np.linalg.norm(z)
+        if (
+            glows_evenly(scene.materials[shape.material])
+            and _is_mesh(shape.mesh, _model("disk"))
+            and abs(x @ z) <= SLACK * lengths
+        ):
+            corner = shape.transform[:3, 3] - x - z
+            flag = layout.CONSTANT["LIGHT_RECTANGLE"] | layout.CONSTANT["LIGHT_DISK"]
+            normal, count = surfaces["ng"][triangles[first]], len(shape.mesh.triangles)
+            disks.append(WholeLight(first, count, flag, corner, 2 * x, 2 * z, normal))
+    return disks
+
+
+def _whole_shapes(
+    shapes: Sequence[Shape], surfaces: np.ndarray, triangles: np.ndarray
+) -> Iterator[tuple[int, Shape]]:
+    """Yield the shapes all of whose triangles emit, and the first of these."""
+    shape_of = surfaces["shape"][triangles]
+    for number, shape in enumerate(shapes):
+        first, end = np.searchsorted(shape_of, [number, number + 1])
+        if end > first and end - first == len(shape.mesh.triangles):
+            yield int(first), shape
 
 
 def is_round(scene: Scene, shape: Shape) -> bool:
     """Return whether a shape is a sphere that glows evenly."""
     if not glows_evenly(scene.materials[shape.material]):
         return False
-    mesh, ball = shape.mesh, _ball()
-    if mesh.positions.shape != ball.positions.shape or not (
-        np.array_equal(mesh.positions, ball.positions)
-        and np.array_equal(mesh.triangles, ball.triangles)
-    ):
+    if not _is_mesh(shape.mesh, _model("sphere")):
         return False
     linear = shape.transform[:3, :3].astype(np.float64)
     squares = linear.T @ linear
@@ -123,8 +145,14 @@ def is_round(scene: Scene, shape: Shape) -> bool:
 
 
 @cache
-def _ball() -> Mesh:
-    return primitives.sphere()
+def _model(name: str) -> Mesh:
+    return primitives.PRIMITIVES[name]()
+
+
+def _is_mesh(mesh: Mesh, model: Mesh) -> bool:
+    return np.array_equal(mesh.positions, model.positions) and np.array_equal(
+        mesh.triangles, model.triangles
+    )
 
 
 def _rectangles(scene: Scene, surfaces: np.ndarray, triangles: np.ndarray) -> list[WholeLight]:

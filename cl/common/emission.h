@@ -92,6 +92,14 @@ LARGE_FUNCTION Emission emit(
         const Mask whole = (flags & LIGHT_RECTANGLE) != 0u;
         b1 = pick(whole, u1, b1);
         b2 = pick(whole, u2, b2);
+        const Mask disk = whole & ((flags & LIGHT_DISK) != 0u);
+        if (any_lane(disk)) {
+            Float part1;
+            Float part2;
+            sample_disk(u1, u2, &part1, &part2);
+            b1 = pick(disk, part1, b1);
+            b2 = pick(disk, part2, b2);
+        }
 #endif
         const Mask two_sided = (flags & MATERIAL_TWO_SIDED_EMISSION) != 0u;
         const Float side = pick(two_sided & (side_bits >= 0x80000000u), (Float)(-1.0f), (Float)(1.0f));

@@ -24,6 +24,7 @@
 #define TEXTURE_SRGB 32u
 #define LIGHT_RECTANGLE 256u // the light is two triangles: e1 and e2 are edges of a rectangle
 #define LIGHT_SPHERE 512u // the light is a sphere: many triangles
+#define LIGHT_DISK 1024u // of the rectangle only the disk in it gives light
 #define LIGHT_TRIANGLE 0u
 #define LIGHT_ENVIRONMENT 1u
 #define LIGHT_POINT 2u
@@ -36,6 +37,7 @@
 #define SAMPLER_RANDOM 1u
 #define PAIR_VERTEX 2u // first pair of random numbers of the first vertex
 #define VERTEX_PAIRS 4u // pairs of each vertex
+#define DISK_SEGMENTS 64u // corners of a light that is a disk
 #define SPHERE_COLUMNS 64u // of faces of a light that is a sphere
 #define SPHERE_ROWS 32u
 #define STRIP_ROWS 4u // rows of pixels that the queue takes column by column
@@ -717,7 +719,7 @@ typedef struct {
     float area; // m^2, of a triangle
     float offset; // of a triangle, as Surface.offset
     uint emission_texture; // index, NO_TEXTURE for none
-    uint flags; // of the material; LIGHT_RECTANGLE or LIGHT_SPHERE
+    uint flags; // of the material; LIGHT_RECTANGLE, with LIGHT_DISK or not, or LIGHT_SPHERE
     float power; // candela along its brightest direction, or lux from infinitely far
     float pad[4]; // fills the record
 } Light;

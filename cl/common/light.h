@@ -455,6 +455,14 @@ LARGE_FUNCTION LightSample sample_light(
         const Mask whole = on_triangle & ((flags & LIGHT_RECTANGLE) != 0u);
         b1 = pick(whole, u1, b1);
         b2 = pick(whole, u2, b2);
+        const Mask disk = whole & ((flags & LIGHT_DISK) != 0u);
+        if (any_lane(disk)) {
+            Float part1;
+            Float part2;
+            sample_disk(u1, u2, &part1, &part2);
+            b1 = pick(disk, part1, b1);
+            b2 = pick(disk, part2, b2);
+        }
         Mask near = whole & is_close(p0, e1, e2, origin);
         Float solid = (Float)(1.0f);
         if (any_lane(near)) {
@@ -467,6 +475,9 @@ LARGE_FUNCTION LightSample sample_light(
             b1 = pick(near, part1, b1);
             b2 = pick(near, part2, b2);
         }
+        Mask there = MASK_ALL;
+        if (any_lane(disk & near))
+            there = !(disk & near) | on_disk(b1, b2);
 #endif
         Vec3 q = add_scaled(add_scaled(p0, e1, b1), e2, b2);
 #if SPHERES
@@ -487,7 +498,10 @@ LARGE_FUNCTION LightSample sample_light(
         const Vec3 wi = normalize3(toward);
         const Mask two_sided = (flags & MATERIAL_TWO_SIDED_EMISSION) != 0u;
         const Float cosine = -dot3(ng, wi);
-        const Mask lit = on_triangle & ((cosine > 0.0f) | two_sided) & (area > 0.0f);
+        Mask lit = on_triangle & ((cosine > 0.0f) | two_sided) & (area > 0.0f);
+#if RECTANGLES
+        lit &= there;
+#endif
         Vec3 emission = vec3(GATHER(lights, light, intensity[0]), GATHER(lights, light, intensity[1]),
                              GATHER(lights, light, intensity[2]));
 #if TEXTURES

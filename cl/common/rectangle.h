@@ -1,4 +1,6 @@
-// Rectangles as lights: the solid angle that one fills as seen from a point, and uniform directions in it.
+// Rectangles as lights: the solid angle that one fills as seen from a point, and uniform directions in it.  And disks,
+// polygons of DISK_SEGMENTS corners in such rectangles: near ones are drawn with what is beside them, where
+// there is no light.
 //
 // Urena, Fajardo, King: An Area-Preserving Parametrization for Spherical Rectangles, 2013.  Its angles are
 // taken as arc tangents and its squares as differences that do not cancel where the view is grazing.
@@ -88,5 +90,34 @@ static inline void sample_rectangle(SeenRectangle r, Float u1, Float u2, Float *
     const Float across = clamp(h * sqrt(d2 / max(1.0f - h * h, 1e-12f)), r.y0, r.y1);
     *part1 = (along - r.x0) / max(r.x1 - r.x0, 1e-30f);
     *part2 = (across - r.y0) / max(r.y1 - r.y0, 1e-30f);
+}
+
+/// Whether the point at parts of the edges of its rectangle is on the disk.
+static inline Mask on_disk(Float part1, Float part2)
+{
+    const Float x = 2.0f * part1 - 1.0f;
+    const Float z = 2.0f * part2 - 1.0f;
+    const Float turns = atan2_lanes(x, z) * (0.5f * INV_PI);
+    const Float segment = floor(pick(turns < 0.0f, turns + 1.0f, turns) * (float)DISK_SEGMENTS);
+    Float c;
+    Float s;
+    cos_sin_turns((segment + 0.5f) / (float)DISK_SEGMENTS, &c, &s);
+    return x * s + z * c <= cos(PI / DISK_SEGMENTS);
+}
+
+/// Draw a point of the disk uniformly, as parts of the edges of its rectangle.
+static inline void sample_disk(Float u1, Float u2, Float *part1, Float *part2)
+{
+    const Float place = u1 * (float)DISK_SEGMENTS;
+    const Float segment = min(floor(place), (Float)(DISK_SEGMENTS - 1.0f));
+    const Float root = 0.5f * sqrt(place - segment);
+    Float c0;
+    Float s0;
+    Float c1;
+    Float s1;
+    cos_sin_turns(segment / (float)DISK_SEGMENTS, &c0, &s0);
+    cos_sin_turns((segment + 1.0f) / (float)DISK_SEGMENTS, &c1, &s1);
+    *part1 = 0.5f + root * (s0 + u2 * (s1 - s0));
+    *part2 = 0.5f + root * (c0 + u2 * (c1 - c0));
 }
 #endif

@@ -403,7 +403,7 @@ LIGHT = Record(
     float area - m^2, of a triangle
     float offset - of a triangle, as Surface.offset
     uint emission_texture - index, NO_TEXTURE for none
-    uint flags - of the material; LIGHT_RECTANGLE or LIGHT_SPHERE
+    uint flags - of the material; LIGHT_RECTANGLE, with LIGHT_DISK or not, or LIGHT_SPHERE
     float power - candela along its brightest direction, or lux from infinitely far
     float pad[4] - fills the record
     """),
@@ -1074,6 +1074,7 @@ CONSTANTS = (
     ("TEXTURE_SRGB", 32, ""),
     ("LIGHT_RECTANGLE", 256, "the light is two triangles: e1 and e2 are edges of a rectangle"),
     ("LIGHT_SPHERE", 512, "the light is a sphere: many triangles"),
+    ("LIGHT_DISK", 1024, "of the rectangle only the disk in it gives light"),
     ("LIGHT_TRIANGLE", 0, ""),
     ("LIGHT_ENVIRONMENT", 1, ""),
     ("LIGHT_POINT", 2, ""),
@@ -1086,6 +1087,7 @@ CONSTANTS = (
     ("SAMPLER_RANDOM", 1, ""),
     ("PAIR_VERTEX", 2, "first pair of random numbers of the first vertex"),
     ("VERTEX_PAIRS", 4, "pairs of each vertex"),
+    ("DISK_SEGMENTS", primitives.DISK_SEGMENTS, "corners of a light that is a disk"),
     ("SPHERE_COLUMNS", primitives.SPHERE_COLUMNS, "of faces of a light that is a sphere"),
     ("SPHERE_ROWS", primitives.SPHERE_ROWS, ""),
     ("STRIP_ROWS", 4, "rows of pixels that the queue takes column by column"),
