@@ -68,6 +68,17 @@ def test_the_guide_keeps_no_cell_for_mirrors_and_glass(device):
     assert cells[0] == 0 < cells[1]
 
 
+@pytest.mark.slow
+def test_the_radiance_cache_knows_no_cell_of_mirrors_and_glass(device):
+    matt = lambertian(0.5)
+    known = [
+        render(device, still_life(*materials, environment=0.3), 64, termination="cache")
+        for materials in ((MIRROR, GLASS), (matt, GLASS))
+    ]
+    cells = [image.stats["cache"]["known_cells"] for image in known]
+    assert cells[0] == 0 < cells[1]
+
+
 @pytest.mark.parametrize("material", [MIRROR, GLASS], ids=["mirror", "glass"])
 def test_all_ways_to_light_a_room_agree_on_what_is_seen_in_it(device, material):
     """Sampling lights alone must not lose the lamp that a mirror shows."""
