@@ -421,7 +421,8 @@ def _tree(triangles: int) -> tuple[BufferSpec, ...]:
 
 
 def _mib(count: int) -> str:
-    return f"{count / 2**20:.0f}"
+    mib = count / 2**20
+    return f"{mib:.0f}" if mib >= 10.0 else f"{mib:.2g}"
 
 
 def _check_metropolis(outputs: frozenset[str], halves: bool) -> None:
