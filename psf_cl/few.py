@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from psf_cl.device import layout
+from psf_cl.scene.model import Material, hides_back
+from psf_cl.tables import Geometry
 
 #: By how many roundings a place on a plate may be wrong: three times those on the way to it and to
 #: what the corners say.
@@ -82,6 +84,15 @@ class Plates:
 
 
 NO_PLATES = Plates(np.zeros(0, layout.PLATE.dtype), 0)
+
+
+def list_of(
+    geometry: Geometry, materials: tuple[Material, ...], labels: np.ndarray | None
+) -> tuple[Few, Plates]:
+    """Return the triangles of a small scene and their flat pieces; ``labels`` as there."""
+    few = few_triangles(geometry.positions, geometry.cut_out, labels)
+    hiding = np.array([hides_back(material) for material in materials], bool)
+    return few, flat_pieces(few, geometry.cut_out | hiding[geometry.surfaces["material"]])
 
 
 def flat_pieces(few: Few, apart: np.ndarray) -> Plates:

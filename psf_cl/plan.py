@@ -11,7 +11,7 @@ import numpy as np
 
 from psf_cl.device import layout
 from psf_cl.errors import DeviceError, InputError
-from psf_cl.few import few_triangles
+from psf_cl.few import list_of
 from psf_cl.image import AOVS
 from psf_cl.instancing import Levels, split
 from psf_cl.measure.timing import Declared
@@ -295,11 +295,11 @@ def make_plan(
     shown = sum(len(shape.mesh.triangles) for shape in shapes)
     levels = split(scene)
     triangles = shown if levels is None else levels.triangle_count
-    corners = _few_corners(scene, shown, traits)
+    corners, plates = _few_pieces(scene, shown, traits)
     features = _features(scene, settings, outputs)
     outputs = _without_light_aovs(outputs, features)
     features["AOV_LIGHTS"] = _aov_lights(outputs, features["LIGHT_SAMPLING"])
-    features["FEW"] = _few(shown, corners, traits)
+    features["FEW"] = _few(shown, corners, plates, traits)
     features["INSTANCES"] = _instances(levels, shown)
     features["TEMPORAL"] = _temporal(scene, settings, features)
     features["CELL_HISTORY"] = _cell_history(settings, features)
@@ -478,23 +478,26 @@ def _instances(levels: Levels | None, shown: int) -> Feature:
     return Feature(levels.index_bits, f"{places}: {kept}")
 
 
-def _few_corners(scene: Scene, triangles: int, traits: DeviceTraits) -> int:
-    """Return how many distinct corners a small scene has, 0 for one that is too large to ask."""
+def _few_pieces(scene: Scene, triangles: int, traits: DeviceTraits) -> tuple[int, int]:
+    """Return the distinct corners and the plates of a small scene, 0 of one too large to ask."""
     if triangles > traits.few_triangles:
-        return 0
-    positions, labels = flatten(scene, densities=False).positions, corner_labels(scene)
-    return len(few_triangles(positions, labels=labels).corners)
+        return 0, 0
+    geometry = flatten(scene, densities=False)
+    few, plates = list_of(geometry, scene.materials, corner_labels(scene))
+    return len(few.corners), len(plates.records)
 
 
-def _few(triangles: int, corners: int, traits: DeviceTraits) -> Feature:
+def _few(triangles: int, corners: int, plates: int, traits: DeviceTraits) -> Feature:
     """Return whether all triangles are tested, with the room for their corners."""
     if triangles > traits.few_triangles:
         return Feature(0, f"a tree: {triangles} triangles")
     if corners > traits.few_corners:
         return Feature(0, f"a tree: {corners} corners")
+    if plates > traits.few_plates:
+        return Feature(0, f"a tree: {triangles} triangles, {plates} plates")
     # In steps, so that scenes of about the same size share their programs.
     room = max(32 * -(-corners // 32), 32)
-    return Feature(room, f"no tree: {triangles} triangles between {corners} corners")
+    return Feature(room, f"no tree: {triangles} triangles, {plates} plates, {corners} corners")
 
 
 def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict[str, Feature]:

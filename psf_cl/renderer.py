@@ -30,7 +30,7 @@ from psf_cl.device.program import Launch, Program
 from psf_cl.device.sources import source_digest
 from psf_cl.device.two_levels import build_two_levels
 from psf_cl.errors import DeviceError, InputError, NoRoomError
-from psf_cl.few import NO_PLATES, Few, Plates, few_triangles, flat_pieces
+from psf_cl.few import NO_PLATES, Few, Plates, list_of
 from psf_cl.image import Image
 from psf_cl.instancing import Placed, place
 from psf_cl.measure.errors import error_of_halves
@@ -40,7 +40,7 @@ from psf_cl.scene import animation
 from psf_cl.scene.digest import scene_digest
 from psf_cl.scene.far import far_from_origin, moved
 from psf_cl.scene.load import load_scene
-from psf_cl.scene.model import Scene, hides_back
+from psf_cl.scene.model import Scene
 from psf_cl.scheduler import MAX_PASSES, Hooks, Progress, Scheduler, doubling_epoch, longest_epoch
 from psf_cl.settings import Settings, resolve
 from psf_cl.stages import (
@@ -1042,9 +1042,7 @@ class Renderer:
         few, plates = None, NO_PLATES
         if self.plan.features["FEW"].value:
             labels = motion.corner_labels(self.moving)
-            few = few_triangles(geometry.positions, geometry.cut_out, labels)
-            hiding = np.array([hides_back(material) for material in scene.materials], bool)
-            plates = flat_pieces(few, geometry.cut_out | hiding[geometry.surfaces["material"]])
+            few, plates = list_of(geometry, scene.materials, labels)
         self.dropped_triangles = few.dropped if few else 0
         self.few = few
         self.surfaces = geometry.surfaces

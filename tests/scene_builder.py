@@ -27,6 +27,9 @@ if TYPE_CHECKING:
     from psf_cl.image import Image
 
 Vector = Sequence[float] | np.ndarray
+#: Traits of devices that trace up to so much without a tree.
+SMALL = {"few_triangles": 160, "few_corners": 128, "few_plates": 160}
+
 IDENTITY = np.eye(4)
 
 

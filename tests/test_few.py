@@ -4,7 +4,7 @@ import numpy as np
 import planes
 import pytest
 from rays import NO_HIT, all_hits, rays_at_edges
-from scene_builder import IDENTITY, build, camera, floor, glowing, lambertian, render
+from scene_builder import IDENTITY, SMALL, build, camera, floor, glowing, lambertian, render
 from trimesh.creation import icosphere
 
 from psf_cl import few, tables
@@ -487,7 +487,7 @@ def scene_of(count):
 
 def on_both(device, scene, spp, outputs):
     """Return the images with the list of triangles and with a tree, and the list's plan."""
-    traits = DeviceTraits("cpu", 16, 16, 1024, 8, few_triangles=160, few_corners=128)
+    traits = DeviceTraits("cpu", 16, 16, 1024, 8, **SMALL)
     plan = make_plan(scene, Settings(), outputs, traits)
     few = render(Device(device.context, traits), scene, spp, outputs)
     without = DeviceTraits("cpu", 16, 16, 1024, 8)
@@ -510,13 +510,31 @@ def test_a_scene_of_many_corners_gets_a_tree_though_its_triangles_are_few():
         points = rng.uniform(-1, 1, (corner_count, 3)).astype(np.float32)
         faces = np.arange(-(-corner_count // 3) * 3, dtype=np.uint32).reshape(-1, 3) % corner_count
         mesh = Mesh("points", points, faces)
-        return make_plan(
-            build([(mesh, IDENTITY, lambertian(0.5))], camera((0, 0, 4), (0, 0, 0))), Settings()
-        )
+        shapes = [(mesh, IDENTITY, lambertian(0.5))]
+        return make_plan(build(shapes, camera((0, 0, 4), (0, 0, 0))), Settings())
 
     for corners, room in ((1, 32), (32, 32), (33, 64), (128, 128), (129, 0)):
         assert plan(corners).features["FEW"].value == room
     assert plan(129).features["FEW"].reason == "a tree: 129 corners"
+
+
+def test_a_scene_of_many_plates_gets_a_tree_and_boxes_count_by_their_sides():
+    def reason(count, mesh):
+        step = transform.translation([2.5, 0.0, 0.0])
+        places = [np.linalg.matrix_power(step, k) for k in range(count)]
+        shapes = [(mesh, place, lambertian(0.5)) for place in places]
+        return make_plan(build(shapes, camera((0, 0, 4), (0, 0, 0))), Settings()).features["FEW"]
+
+    ball = Mesh("ball", np.asarray(BALL.vertices, np.float32), np.asarray(BALL.faces, np.uint32))
+    assert reason(1, ball).value and reason(1, ball).reason.endswith("80 plates, 42 corners")
+    assert reason(2, primitives.box()).reason == "no tree: 24 triangles, 12 plates, 16 corners"
+    half = Mesh("half", ball.positions, ball.triangles[:1])
+    shapes = [
+        (ball, IDENTITY, lambertian(0.5)),
+        (half, transform.translation([3.0, 0, 0]), lambertian(0.5)),
+    ]
+    plan = make_plan(build(shapes, camera((0, 0, 4), (0, 0, 0))), Settings())
+    assert plan.features["FEW"].reason == "a tree: 81 triangles, 81 plates"
 
 
 def test_a_scene_of_bad_triangles_only_renders_its_sky(device):

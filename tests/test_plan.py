@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scene_builder import (
     IDENTITY,
+    SMALL,
     build,
     camera,
     floor,
@@ -121,7 +122,7 @@ def buffers_of(flags):
 
 def few(device):
     """Return the same device, but small scenes get a list of triangles in place of a tree."""
-    return Device(device.context, replace(device.traits, few_triangles=160, few_corners=128))
+    return Device(device.context, replace(device.traits, **SMALL))
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ import pytest
 from rays import NO_HIT, all_hits, rays_through, soup
 from scene_builder import (
     IDENTITY,
+    SMALL,
     assert_blocks_equal,
     build,
     camera,
@@ -137,7 +138,7 @@ def traced(device, scene, rays, of_camera):
 
 @pytest.fixture
 def few_device(lane_device):
-    traits = dataclasses.replace(lane_device.traits, few_triangles=160, few_corners=128)
+    traits = dataclasses.replace(lane_device.traits, **SMALL)
     return Device(lane_device.context, traits)
 
 

@@ -236,7 +236,15 @@ def render(job: Job, lanes: int) -> set[str]:
     Launch.__call__ = noting  # type: ignore[method-assign]
     few = 0 if job.tree else 400
     traits = DeviceTraits(
-        "cpu", lanes, 16, slots=64, group=4, run=2, few_triangles=few, few_corners=few
+        "cpu",
+        lanes,
+        16,
+        slots=64,
+        group=4,
+        run=2,
+        few_triangles=few,
+        few_corners=few,
+        few_plates=few,
     )
     device = open_device("oclgrind", traits)
     settings = resolve({}, "a job", job.preset, SMALL | dict(job.settings))
