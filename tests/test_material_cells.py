@@ -129,7 +129,7 @@ def test_known_cells_are_means_of_what_was_stored_and_stay(device):
     np.testing.assert_array_equal(got["visits"][new], sums["count"][new])
 
 
-def test_same_bits_for_any_pool_and_number_of_threads(device):
+def test_same_bits_for_any_pool(device):
     truth = render(device, room(), 40, **CACHE).rgb
     assert not np.array_equal(truth, render(device, room(), 40).rgb)
     for slots in (128, 1024):
