@@ -810,6 +810,7 @@ def test_the_program_ends_without_a_traceback(tmp_path):
     help_text = run("render", "--help")
     assert help_text.returncode == 0 and "default 64" in help_text.stdout
     assert "max_depth" in help_text.stdout
+    assert "true | false; default true" in help_text.stdout and "None" not in help_text.stdout
 
 
 # What modules make of an exception while they are imported.

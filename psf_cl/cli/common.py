@@ -282,15 +282,31 @@ def show(*renderables: RenderableType, file: TextIO | None = None) -> None:
 
 
 def _settings_help() -> str:
+    """Return what each setting is for and may be, in lines as wide as those of the options."""
     import dataclasses
+    import shutil
+    import textwrap
 
+    width = max(shutil.get_terminal_size().columns - 2, 60)
+    column = max(len(item.name) for item in dataclasses.fields(Settings)) + 3
+    indent = " " * column
     lines = ["settings:"]
     for item in dataclasses.fields(Settings):
-        choices = item.metadata.get("choices")
-        low, high = item.metadata.get("range", (None, None))
-        values = " | ".join(choices) if choices else f"{low} to {high}"
-        lines.append(f"  {item.name:16} {item.metadata['doc']}")
-        lines.append(f"  {'':16} {values}; default {item.default}")
+        default = str(item.default).lower() if isinstance(item.default, bool) else item.default
+        if isinstance(item.default, bool):
+            values = "true | false"
+        elif "choices" in item.metadata:
+            values = " | ".join(item.metadata["choices"])
+        else:
+            low, high = item.metadata["range"]
+            values = f"{low:g} to {high:g}" if isinstance(low, float) else f"{low} to {high}"
+        for text, start in (
+            (item.metadata["doc"], f"  {item.name}".ljust(column)),
+            (f"{values}; default {default}", indent),
+        ):
+            lines += textwrap.wrap(
+                text, width, initial_indent=start, subsequent_indent=indent, break_on_hyphens=False
+            )
     return "\n".join(lines)
 
 
