@@ -35,7 +35,8 @@ from psf_cl.image import Image
 from psf_cl.instancing import Placed, place
 from psf_cl.measure.errors import error_of_halves
 from psf_cl.mover import Mover
-from psf_cl.plan import Plan, Room, make_plan, restores, whole_kinds
+from psf_cl.pictures import image_of
+from psf_cl.plan import Plan, Room, make_plan, whole_kinds
 from psf_cl.scene import animation
 from psf_cl.scene.digest import scene_digest
 from psf_cl.scene.far import far_from_origin, moved
@@ -59,6 +60,7 @@ from psf_cl.stages import (
     temporal,
     virtual_lights,
 )
+from psf_cl.stats import statistics_of
 
 #: Looks of the host at the counters for each count of the paths by depth, which takes 0.4 ms on two
 #: CPU cores; the first look, which is left out, is at a pool that is still empty.
@@ -212,18 +214,19 @@ class Renderer:
         for launch, items in self.cell_launches:
             launch(items, film.GROUP)
         for launch in self.splat_launches:
-            launch(self._film_items(1), film.GROUP)
+            launch(self.film_items(1), film.GROUP)
         for launch, planes in self.film_launches:
-            launch(self._film_items(planes), film.GROUP)
+            launch(self.film_items(planes), film.GROUP)
         if self.half is not None:
-            self.half(self._film_items(1), film.GROUP)
+            self.half(self.film_items(1), film.GROUP)
         if self.add_seen is not None:
-            self.add_seen(self._film_items(1), film.GROUP)
+            self.add_seen(self.film_items(1), film.GROUP)
         if self.clear_cells is not None:
             self.clear_cells(cells.buckets(self.plan.pixel_count))
         self.advance(1)
 
-    def _film_items(self, planes: int) -> int:
+    def film_items(self, planes: int) -> int:
+        """Return the work items that add up ``planes`` of the film."""
         return -(-planes * self.plan.pixel_count // self.plan.traits.lanes)
 
     def _counters(self) -> np.ndarray:
@@ -493,157 +496,11 @@ class Renderer:
 
     def snapshot(self, names: Iterable[str] = ("rgb",)) -> Image:
         """Return the image as it is now, with only the AOVs in ``names``."""
-        return self._image(set(names))
+        return image_of(self, set(names))
 
     def image(self) -> Image:
         """Return the image with every planned AOV and the statistics."""
-        return self._image({"rgb"} | self.plan.outputs)
-
-    def _image(self, names: set[str]) -> Image:
-        x, y, width, height = self.plan.crop
-        # Of the device: after an interrupt the host has not seen its last passes.
-        counters = self.device.read(self.buffers["counters"], layout.COUNTER_INDEX["finished"])
-        partial = counters[layout.COUNTER_INDEX["film_pass"]] == self.scheduler.first
-        order = self.order
-        sums: dict[str, np.ndarray] = {}
-        for ring, name, planes in film.PLANES:
-            if name not in self.buffers:
-                continue
-            if partial:
-                # Not one pass is complete: what is there of the first is all there is.
-                self.device.fill(self.buffers[name])
-                self._add_launch(ring, name, planes, partial=True)(
-                    self._film_items(planes), film.GROUP
-                )
-                if name == "film" and self.add_unfiltered is not None:
-                    self.add_unfiltered(self.plan.pixel_count, film.GROUP)
-            sums[name] = self.device.read(self.buffers[name]).reshape(planes, -1)
-            if partial:
-                self.device.fill(self.buffers[name])
-
-        def mean(plane: np.ndarray) -> np.ndarray:
-            count = np.maximum(plane["count"], 1).astype(np.float32)
-            # The part that rounding took from the sum is known: it goes back before the division.
-            values = (plane["sum"] - plane["lost"]) / count[:, None]
-            image = np.zeros((width * height, 3), np.float32)
-            image[order] = values
-            return image.reshape(height, width, 3)
-
-        aovs: dict[str, np.ndarray] = {}
-        main = sums["film"][0]
-        aovs["rgb"] = mean(main)
-        if "film_direct" in sums:
-            aovs["direct"] = mean(sums["film_direct"][0])
-        if restores(self.settings).value and not partial:
-            aovs["rgb"] = self._restored(counters)
-        elif self.picture_launches and not partial:
-            aovs["rgb"] = self._picture()
-        if "direct" in aovs:
-            aovs["indirect"] = aovs["rgb"] - aovs["direct"]
-        if "film_features" in sums:
-            aovs["albedo"], aovs["normal"], depth = (mean(plane) for plane in sums["film_features"])
-            aovs["depth"] = depth[..., :1]
-
-        if "film_choices" in sums:
-            choices = mean(sums["film_choices"][0])
-            for index, name in enumerate((*photons.VIEWS, "light_pmf")):
-                aovs[name] = choices[..., index : index + 1]
-
-        def scalar(values: np.ndarray) -> np.ndarray:
-            image = np.zeros(width * height, np.float32)
-            image[order] = values
-            return image.reshape(height, width, 1)
-
-        aovs["samples"] = scalar(main["count"])
-        if names & {"motion", "history", "alpha", "gradient"}:
-            aovs |= self._temporal_aovs(main["count"], bool(partial))
-        if "film_bounces" in sums:
-            aovs["bounces"] = mean(sums["film_bounces"][0])[..., :1]
-        if names & set(guide.VIEWS):
-            aovs |= self._guide_aovs(bool(partial))
-        if names & set(cells.VIEWS):
-            aovs |= self._cell_aovs(main["count"])
-        count = main["count"].astype(np.float64)
-        variance = main["squares"] / np.maximum(count - 1, 1) / np.maximum(count, 1)
-        aovs["variance"] = scalar(np.where(count > 1, variance, 0.0))
-        return Image(
-            aovs={name: aovs[name] for name in aovs if name in names},
-            stats=self.stats(),
-            x=x,
-            y=y,
-            full_width=self.scene.width,
-            full_height=self.scene.height,
-        )
-
-    def _picture(self) -> np.ndarray:
-        """Return the image with what is done to it before it is handed out, ``(h, w, 3)``."""
-        for launch, items in self.picture_launches:
-            launch(items, film.GROUP)
-        if "filtered" in self.buffers:
-            pixels = self.device.read(self.buffers["filtered"]).reshape(-1, 4)[:, :3]
-        else:
-            pixels = self.device.read(self.buffers["light"])["rgb"]
-        return self._in_rows(pixels)
-
-    def _in_rows(self, pixels: np.ndarray) -> np.ndarray:
-        """Return pixels in the order of the queue, ``(n, c)``, as ``(h, w, c)`` float32."""
-        image = np.zeros(pixels.shape, np.float32)
-        image[self.order] = pixels
-        return image.reshape(self.plan.crop[3], self.plan.crop[2], -1)
-
-    def _temporal_aovs(self, count: np.ndarray, partial: bool) -> dict[str, np.ndarray]:
-        """Return what frames say of one another; ``count`` are the samples of this one."""
-        nothing = np.zeros(len(count), np.float32)
-        aovs = {"history": count, "alpha": nothing + 1.0, "gradient": nothing}
-        if self.plan.features["TEMPORAL"].value and not partial:
-            light = self.device.read(self.buffers["light"])
-            names = {"history": "count", "alpha": "alpha", "gradient": "change"}
-            aovs = {name: light[field] for name, field in names.items()}
-        if "motion" in self.buffers:
-            for launch, items in self.motion_launches:
-                launch(items, film.GROUP)
-            aovs["motion"] = self.device.read(self.buffers["motion"])
-        return {
-            name: self._in_rows(values.reshape(self.plan.pixel_count, -1))
-            for name, values in aovs.items()
-        }
-
-    def _cell_aovs(self, count: np.ndarray) -> dict[str, np.ndarray]:
-        """Return what pixels saw of cells: means over their ``count`` samples; 0 without cells."""
-        views = np.zeros(len(count), layout.CELL_VIEW.dtype)
-        if "film_cells" in self.buffers:
-            views = self.device.read(self.buffers["film_cells"])
-        divisor = np.maximum(count, 1).astype(np.float32)
-        return {
-            name: self._in_rows(
-                views[field] if name == "cells" else (views[field] / divisor)[:, None]
-            )
-            for name, field in cells.VIEWS.items()
-        }
-
-    def _guide_aovs(self, partial: bool) -> dict[str, np.ndarray]:
-        """Return what the guide knows at what pixels see; 0 without a guide."""
-        views = np.zeros(self.plan.pixel_count, layout.GUIDE_VIEW.dtype)
-        if "guide_views" in self.buffers and not partial:
-            items = -(-self.plan.pixel_count // self.plan.traits.lanes)
-            self.view_guide(items, film.GROUP)
-            views = self.device.read(self.buffers["guide_views"])
-        return {
-            name: self._in_rows(views[field].reshape(len(views), -1))
-            for name, field in guide.VIEWS.items()
-        }
-
-    def _restored(self, counters: np.ndarray) -> np.ndarray:
-        """Return the image with what averages per cell lost, ``(h, w, 3)``."""
-        passes = int(counters[layout.COUNTER_INDEX["film_pass"]]) - self.scheduler.first
-        take, pixels = self.restore_launches["take"][0]
-        tilt = restore.tilt(passes, self.settings.splits)
-        take.set(tilt=tilt, caution=restore.caution(passes))
-        take(pixels, film.GROUP)
-        for step in (*restore.radii(passes), "pixels"):
-            for launch, items in self.restore_launches[step]:
-                launch(items, film.GROUP)
-        return self._in_rows(self.device.read(self.buffers["restored"]).reshape(-1, 4)[:, :3])
+        return image_of(self, {"rgb"} | self.plan.outputs)
 
     def settle(self) -> None:
         """Finish the passes that have begun, so that ``save`` can write a checkpoint."""
@@ -785,49 +642,7 @@ class Renderer:
 
     def stats(self) -> dict[str, Any]:
         """Return what ``--stats`` writes, without errors against a reference."""
-        counters = self.device.read(self.buffers["counters"], layout.COUNTER_INDEX["finished"])
-        passes = int(counters[layout.COUNTER_INDEX["film_pass"]]) - self.scheduler.first
-        rays = {kind: layout.rays_so_far(counters, kind) for kind in layout.RAY_KINDS}
-        stages = [{"name": name} | asdict(spent) for name, spent in self.device.totals.items()]
-        return {
-            "scene": self.scene.path,
-            "spp": passes,
-            "passes": passes,
-            "render_seconds": self.scheduler.clock.now(),
-            "build_seconds": self.build_seconds,
-            "compile_seconds": self.compile_seconds,
-            "load_seconds": self.load_seconds,
-            "rays": rays,
-            "device": self.device.name,
-            "driver": self.device.driver,
-            "peak_device_bytes": self.device.peak_bytes,
-            "stages": stages,
-            "occupancy": self._occupancy(),
-            "counters": {
-                "rejected_samples": int(counters[layout.COUNTER_INDEX["rejected_samples"]]),
-                "dropped_triangles": self.dropped_triangles,
-            },
-            "paths": self._path_statistics(counters, rays),
-            "guide": self._guide_statistics(counters),
-            "cache": self._cache_statistics(counters, rays),
-            "cells": self._cell_statistics(counters),
-            "materials": self._material_statistics(counters),
-            "metropolis": self.chains.statistics() if self.chains else None,
-            "photons": self.photon_map.counts() if self.photon_map else None,
-            "bvh": None
-            if self.bvh is None
-            else {
-                "nodes": self.bvh.node_count,
-                "blocks": self.bvh.block_count,
-                "depth": self.bvh.depth,
-                "rebuilds": self.rebuilds,
-                "rebuilds_without_room": self.unbuilt,
-            },
-            "settings": {
-                name: getattr(self.settings, name) for name in self.settings.__dataclass_fields__
-            },
-            "seed": self.settings.seed,
-        }
+        return statistics_of(self)
 
     def _teach(self, start: int) -> None:
         """Draw the epoch of pass ``start`` by what was learned so far, if that pays."""
@@ -897,84 +712,6 @@ class Renderer:
             for name, value in (("next_pass", start), ("next_pixel", 0)):
                 at = layout.COUNTER_INDEX[name]
                 self.device.write(self.buffers["counters"], np.array([value], np.uint32), at)
-
-    def _guide_statistics(self, counters: np.ndarray) -> dict[str, int | float] | None:
-        if "guide_keys" not in self.buffers:
-            return None
-        keys = self.device.read(self.buffers["guide_keys"])
-        cells = self.device.read(self.buffers["guide_cells"])
-        return {
-            "left_out": self.guide_out is not None,
-            "noise_left": guide.noise_left(cells, self.settings.guide_share),
-            "cells": int(np.count_nonzero(keys)),
-            "load": float(np.count_nonzero(keys)) / len(keys),
-            "taught_cells": int(np.count_nonzero(cells["visits"] >= layout.CONSTANT["GUIDE_BINS"])),
-            "failed_inserts": int(counters[layout.COUNTER_INDEX["guide_failed"]]),
-            "rejected": int(counters[layout.COUNTER_INDEX["guide_rejected"]]),
-        }
-
-    def _cache_statistics(
-        self, counters: np.ndarray, rays: dict[str, int]
-    ) -> dict[str, int | float] | None:
-        if self.freeze_cache is None:
-            return None
-        keys = self.device.read(self.buffers["cache_keys"])
-        cells = self.device.read(self.buffers["cache_cells"])
-        return {
-            "cells": int(np.count_nonzero(keys)),
-            "load": float(np.count_nonzero(keys)) / len(keys),
-            "known_cells": int(np.count_nonzero(cells["visits"])),
-            "ended_paths": layout.whole(counters, "cache_ends") / max(rays["camera"], 1),
-            "failed_inserts": int(counters[layout.COUNTER_INDEX["cache_failed"]]),
-            "rejected": int(counters[layout.COUNTER_INDEX["cache_rejected"]]),
-        }
-
-    def _material_statistics(self, counters: np.ndarray) -> dict[str, int | float] | None:
-        if self.freeze_materials is None:
-            return None
-        keys = self.device.read(self.buffers["material_keys"])
-        known = self.device.read(self.buffers["material_cells"])
-        return {
-            "cells": int(np.count_nonzero(keys)),
-            "load": float(np.count_nonzero(keys)) / len(keys),
-            "known_cells": int(np.count_nonzero(known["visits"])),
-            "failed_inserts": int(counters[layout.COUNTER_INDEX["material_failed"]]),
-        }
-
-    def _path_statistics(
-        self, counters: np.ndarray, rays: dict[str, int]
-    ) -> dict[str, float | None]:
-        """Return how long paths are, and which part of them brings no light at all."""
-        # Chains have no samples that could be dark.
-        pending = self.scheduler.passes == 0 or self.chains is not None
-        paths = max(rays["camera"], 1)
-        dark = layout.whole(counters, "dark_samples")
-        return {
-            "mean_rays": (rays["camera"] + rays["bounce"]) / paths,
-            "zero_contribution": None if pending else dark / paths,
-        }
-
-    def _cell_statistics(self, counters: np.ndarray) -> dict[str, int | float] | None:
-        if self.clear_cells is None:
-            return None
-
-        names = ("failed_inserts", "rejected_cells", "unfiltered_samples")
-        used, passes = layout.whole(counters, "cells_used"), max(self.scheduler.passes, 1)
-        slots = cells.slots_of(self.plan.pixel_count)
-        kept = {}
-        if "kept_keys" in self.buffers:
-            keys = self.device.read(self.buffers["kept_keys"])
-            kept["kept"] = int(np.count_nonzero(keys))
-            kept["failed_histories"] = layout.whole(counters, "failed_histories")
-        return (
-            {name: layout.whole(counters, name) for name in names}
-            | kept
-            | {
-                "cells_per_pass": used / passes,
-                "load": used / passes / slots,
-                "mean_probes": layout.whole(counters, "cell_probes") / max(used, 1),
-            }
-        )
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -1284,7 +1021,7 @@ class Renderer:
             )
         self.film_program = programs["film"]
         self.film_launches = [
-            (self._add_launch(ring, name, planes, partial=False), planes)
+            (self.add_launch(ring, name, planes, partial=False), planes)
             for ring, name, planes in film.PLANES
             if name in self.buffers
         ]
@@ -1424,7 +1161,8 @@ class Renderer:
             self._counters,
         )
 
-    def _add_launch(self, ring: str, name: str, planes: int, partial: bool) -> Launch:
+    def add_launch(self, ring: str, name: str, planes: int, partial: bool) -> Launch:
+        """Return what adds ``ring`` to the film ``name``; ``partial``: of a pass not complete."""
         return self.film_program.bind(
             "add_samples",
             params=self.buffers["params"],
@@ -1434,13 +1172,6 @@ class Renderer:
             planes=planes,
             partial=int(partial),
         )
-
-    def _occupancy(self) -> list[float] | None:
-        """Return the mean share of the slots whose path lives, by its bounces so far."""
-        if not self.statistics:
-            return None
-        shares = self.depth_counts / (max(self.censuses, 1) * self.plan.traits.slots)
-        return [float(share) for share in shares]
 
 
 def prepare_device(

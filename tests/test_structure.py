@@ -25,7 +25,7 @@ ROWS = [
     {"device"},
     {"stages", "few", "tables", "whole_lights", "instancing", "motion", "mover"},
     {"chains", "plan", "scheduler"},
-    {"renderer"},
+    {"renderer", "pictures", "stats"},
     {"cli"},
     {"__init__", "__main__"},
 ]
