@@ -8,6 +8,7 @@
 #include "common/lanes.h"
 #include "common/layout.h"
 #include "common/pool.h"
+#include "common/photons.h"
 #include "common/rng.h"
 #include "common/alpha.h"
 #include "common/surface.h"
@@ -16,12 +17,6 @@
 #include "common/particle_map.h"
 
 #define PLACE_FIELD PATH_RADIANCE_R // and the five behind it
-
-static inline void count_photons(volatile __global uint *photon_counters, uint which, Mask mask)
-{
-    if (any_lane(mask))
-        atomic_add(&photon_counters[which], count_lanes(mask));
-}
 
 /// Fill the pool with photons `first` .. `first` + `count` of the light table; the rest of it is dead.
 ///

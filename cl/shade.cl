@@ -13,14 +13,13 @@
 #include "common/virtual_light.h"
 #include "common/sharing.h"
 #include "common/splits.h"
+#include "common/roulette.h"
 #include "common/chain.h"
 #include "common/guide.h"
 #include "common/guided.h"
 #include "common/cache.h"
 #include "common/material_cells.h"
 #include "common/motion.h"
-
-#define MAX_SURVIVAL 0.999f
 
 // Of the directions, how large a part textures are averaged over.
 #define FOOTPRINT_SHARE (1.0f / 256.0f)

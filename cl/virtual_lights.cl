@@ -7,6 +7,8 @@
 #include "common/lanes.h"
 #include "common/layout.h"
 #include "common/pool.h"
+#include "common/photons.h"
+#include "common/roulette.h"
 #include "common/rng.h"
 #include "common/alpha.h"
 #include "common/surface.h"
@@ -14,14 +16,6 @@
 #include "common/material.h"
 #include "common/light.h"
 #include "common/virtual_light.h"
-
-#define MAX_SURVIVAL 0.999f
-
-static inline void count_photons(volatile __global uint *photon_counters, uint which, Mask mask)
-{
-    if (any_lane(mask))
-        atomic_add(&photon_counters[which], count_lanes(mask));
-}
 
 /// Let every photon that hit something leave a virtual light there, and send it on or end it.
 ///

@@ -604,7 +604,6 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
             "bounces" in outputs, "bounces asked for", "bounces were not asked for"
         ),
         "AOV_GUIDE": _aov_guide(settings, outputs),
-        "AOV_LIGHTS": _aov_lights(outputs, chosen),
         "GUIDE": switch(
             settings.guiding == "learned",
             "guiding is learned",

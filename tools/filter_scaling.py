@@ -243,11 +243,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for key, curves in measured.items():
         print_curves(Console(), key, curves)
     if args.plot is not None:
-        figure = figure_of(measured, args.stop)
-        if args.plot.suffix == ".svg":
-            args.plot.write_text(figure.svg(), encoding="utf-8")
-        else:
-            args.plot.write_bytes(figure.png(1.0))
+        figure_of(measured, args.stop).write(args.plot)
     return 0
 
 

@@ -27,7 +27,7 @@ from psf_cl.device import layout
 from psf_cl.device.device import Device, open_device
 from psf_cl.device.hash_map import buckets_of, slots_for
 from psf_cl.device.program import load_program
-from psf_cl.errors import DeviceError
+from psf_cl.errors import DeviceError, InputError
 from psf_cl.measure import plot
 
 FOLDER = Path(__file__).parent
@@ -149,16 +149,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     rates = [measure(device, slots, args.keys, args.rounds) for slots in sizes]
     Console(width=100).print(table_of(rates))
     if args.plot is not None:
-        figure = figure_of(rates)
-        if args.plot.suffix == ".svg":
-            args.plot.write_text(figure.svg(), encoding="utf-8")
-        else:
-            args.plot.write_bytes(figure.png(1.0))
+        figure_of(rates).write(args.plot)
     return 0
 
 
 if __name__ == "__main__":
     try:
         sys.exit(main())
-    except DeviceError as error:
+    except (InputError, DeviceError) as error:
         sys.exit(f"insert_rate: {error}")

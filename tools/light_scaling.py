@@ -159,11 +159,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     curves = measure(args.most, args.rounds)
     Console().print(table_of(curves))
     if args.plot is not None:
-        figure = figure_of(curves)
-        if args.plot.suffix == ".svg":
-            args.plot.write_text(figure.svg(), encoding="utf-8")
-        else:
-            args.plot.write_bytes(figure.png(1.0))
+        figure_of(curves).write(args.plot)
     return 0
 
 

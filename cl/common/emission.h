@@ -84,23 +84,10 @@ LARGE_FUNCTION Emission emit(
         Float u1;
         Float u2;
         light_point(e.point, &u1, &u2);
-        const Float root = sqrt(u1);
-        Float b1 = root * (1.0f - u2);
-        Float b2 = root * u2;
         const UInt flags = GATHER_U(lights, light, flags);
-#if RECTANGLES
-        const Mask whole = (flags & LIGHT_RECTANGLE) != 0u;
-        b1 = pick(whole, u1, b1);
-        b2 = pick(whole, u2, b2);
-        const Mask disk = whole & ((flags & LIGHT_DISK) != 0u);
-        if (any_lane(disk)) {
-            Float part1;
-            Float part2;
-            sample_disk(u1, u2, &part1, &part2);
-            b1 = pick(disk, part1, b1);
-            b2 = pick(disk, part2, b2);
-        }
-#endif
+        Float b1;
+        Float b2;
+        sample_flat(on_triangle, flags, u1, u2, &b1, &b2);
         const Mask two_sided = (flags & MATERIAL_TWO_SIDED_EMISSION) != 0u;
         const Float side = pick(two_sided & (side_bits >= 0x80000000u), (Float)(-1.0f), (Float)(1.0f));
         Vec3 outward = axis;

@@ -388,6 +388,28 @@ static inline UInt rays_asked(__global const Params *params RAYS_PARAMETERS, Mas
 
 /// Draw a direction to the light that was chosen, for rays that start at `origin`.
 ///
+/// Draw a point of a flat light, uniformly by area, as parts of its two edges; `flags` are the light's.
+static inline void sample_flat(Mask wanted, UInt flags, Float u1, Float u2, Float *part1, Float *part2)
+{
+    // On a triangle without folding, so that strata stay connected.
+    const Float root = sqrt(u1);
+    *part1 = root * (1.0f - u2);
+    *part2 = root * u2;
+#if RECTANGLES
+    const Mask whole = wanted & ((flags & LIGHT_RECTANGLE) != 0u);
+    *part1 = pick(whole, u1, *part1);
+    *part2 = pick(whole, u2, *part2);
+    const Mask disk = whole & ((flags & LIGHT_DISK) != 0u);
+    if (any_lane(disk)) {
+        Float disk1;
+        Float disk2;
+        sample_disk(u1, u2, &disk1, &disk2);
+        *part1 = pick(disk, disk1, *part1);
+        *part2 = pick(disk, disk2, *part2);
+    }
+#endif
+}
+
 /// pdf is 0 where nothing arrives.  `seed`, `reversed_index` and `pair` (the vertex's first) name the numbers.
 LARGE_FUNCTION LightSample sample_light(
     __global const Params *params,
@@ -446,23 +468,13 @@ LARGE_FUNCTION LightSample sample_light(
         // of a sample.  21 u of both ends' coordinates for these (`geometry.h`), 4 u for the point.
         const Float reach = max(fabs(origin.x), max(fabs(origin.y), fabs(origin.z)));
         const Float away = 2.0f * GATHER(lights, light, offset) + 0x1.8p-20f * reach;
-        // Uniform on the triangle, without folding, so that strata stay connected.
-        const Float root = sqrt(u1);
-        Float b1 = root * (1.0f - u2);
-        Float b2 = root * u2;
         const UInt flags = GATHER_U(lights, light, flags);
+        Float b1;
+        Float b2;
+        sample_flat(on_triangle, flags, u1, u2, &b1, &b2);
 #if RECTANGLES
         const Mask whole = on_triangle & ((flags & LIGHT_RECTANGLE) != 0u);
-        b1 = pick(whole, u1, b1);
-        b2 = pick(whole, u2, b2);
         const Mask disk = whole & ((flags & LIGHT_DISK) != 0u);
-        if (any_lane(disk)) {
-            Float part1;
-            Float part2;
-            sample_disk(u1, u2, &part1, &part2);
-            b1 = pick(disk, part1, b1);
-            b2 = pick(disk, part2, b2);
-        }
         Mask near = whole & is_close(p0, e1, e2, origin);
         Float solid = (Float)(1.0f);
         if (any_lane(near)) {

@@ -8,10 +8,13 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from html import escape
+from pathlib import Path
 
 import PIL.Image
 import PIL.ImageDraw
 import PIL.ImageFont
+
+from psf_cl.files import write_whole
 
 #: Colours that the colour-blind tell apart.
 #: Source: Okabe, Ito, "Color Universal Design", 2008; without its yellow, which is faint on white.
@@ -85,6 +88,14 @@ class Drawing:
             for angle, r in corners
         ]
         self.area(points, colour, title=title)
+
+    def write(self, path: Path) -> None:
+        """Write an SVG or a PNG, as the name says.
+
+        Raises:
+            InputError: it cannot be written.
+        """
+        write_whole(path, self.svg().encode() if path.suffix == ".svg" else self.png(1.0))
 
     def place(self, other: Drawing, left: float, top: float) -> None:
         """Add all of another drawing, moved."""
