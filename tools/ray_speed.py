@@ -44,7 +44,7 @@ import psf_cl
 from psf_cl import tables
 from psf_cl.cli.common import positive_integer, size_argument
 from psf_cl.device.device import open_device
-from psf_cl.device.layout import CONSTANT, PATH_FIELDS
+from psf_cl.device.layout import CONSTANT, PATH_FIELDS, path_field_count
 from psf_cl.errors import DeviceError, InputError
 from psf_cl.scene.model import Scene
 from psf_cl.settings import resolve
@@ -115,6 +115,8 @@ class Ours:
             launch.name: (launch, items) for launch, items in self.renderer.bounce_launches
         }
         self.block = device.traits.block
+        features = self.renderer.plan.features
+        self.words = path_field_count({name: item.value for name, item in features.items()})
 
     def run(self, *kernels: str) -> None:
         for name in kernels:
@@ -125,8 +127,8 @@ class Ours:
 
     def fields(self) -> np.ndarray:
         """Return the pool, ``(slots, fields)`` float32."""
-        blocks = self.device.read(self.pool).reshape(-1, len(PATH_FIELDS), self.block)
-        return blocks.transpose(0, 2, 1).reshape(-1, len(PATH_FIELDS))
+        blocks = self.device.read(self.pool).reshape(-1, self.words, self.block)
+        return blocks.transpose(0, 2, 1).reshape(-1, self.words)
 
     def capture(self) -> list[Rays]:
         """Run the path tracer and keep the rays that its kernels meet."""
@@ -153,8 +155,8 @@ class Ours:
         """Return a call that traces ``rays`` and returns the rays per second."""
         name = "connect_lights" if rays.shadow else "intersect_closest"
         launch, all_items = self.launches[name]
-        state = _pool_of(rays, self.block)
-        paths = len(state) // len(PATH_FIELDS)
+        state = _pool_of(rays, self.block, self.words)
+        paths = len(state) // self.words
         items = -(-paths * all_items // self.device.traits.slots)
 
         def trace() -> float:
@@ -199,9 +201,9 @@ def _shadow_rays(name: str, state: np.ndarray) -> Rays:
     return Rays(name, origins, _vectors(state, "toward_x", wanted), shadow=True)
 
 
-def _pool_of(rays: Rays, block: int) -> np.ndarray:
-    """Return whole blocks of the pool that hold ``rays``, flat float32."""
-    state = np.zeros((-(-rays.count // block) * block, len(PATH_FIELDS)), np.float32)
+def _pool_of(rays: Rays, block: int, words: int) -> np.ndarray:
+    """Return whole blocks of the pool that hold ``rays`` in paths of ``words``, flat float32."""
+    state = np.zeros((-(-rays.count // block) * block, words), np.float32)
     used = state[: rays.count]
     origin, direction = ("shadow_x", "toward_x") if rays.shadow else ("origin_x", "direction_x")
     used[:, FIELD[origin] : FIELD[origin] + 3] = rays.origins
@@ -210,9 +212,7 @@ def _pool_of(rays: Rays, block: int) -> np.ndarray:
         used[:, FIELD["light_r"]] = 1.0
     else:
         used[:, FIELD["status"]] = np.uint32(CONSTANT["STATUS_ALIVE"]).view(np.float32)
-    return np.ascontiguousarray(
-        state.reshape(-1, block, len(PATH_FIELDS)).transpose(0, 2, 1)
-    ).reshape(-1)
+    return np.ascontiguousarray(state.reshape(-1, block, words).transpose(0, 2, 1)).reshape(-1)
 
 
 class Mitsuba:
