@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,6 +43,9 @@ from psf_cl.whole_lights import (
 #: Chance that the light table keeps for emitters of finite size where there is also light from
 #: infinitely far: its flux through the scene says little about how much of it comes in.
 NEAR_SHARE = 0.5
+
+#: Triangles that are worked out at once.
+RUN = 1 << 14
 
 #: Of a light, in its record: more is no float32.
 MOST_POWER = 1e38
@@ -118,17 +121,15 @@ def flatten(scene: Scene, densities: bool = True) -> Geometry:
             all="ignore"
         ):  # What overflows here is dropped, and counted, as not finite.
             world = (mesh.positions @ linear.T + shape.transform[:3, 3]).astype(np.float32)
-            corners = world[mesh.triangles]
-            surface = np.zeros(len(corners), layout.SURFACE.dtype)
-            surface["p0"] = corners[:, 0]
-            surface["e1"] = corners[:, 1] - corners[:, 0]
-            surface["e2"] = corners[:, 2] - corners[:, 0]
-            determinant = np.linalg.det(linear)
+            mirrored = bool(np.linalg.det(linear) < 0)
+        corners = np.empty((len(mesh.triangles), 3, 3), np.float32)
+        surface = np.zeros(len(corners), layout.SURFACE.dtype)
+        for rows in _runs(len(corners)):
+            corners[rows] = world[mesh.triangles[rows]]
+            _set_triangles(surface[rows], corners[rows], mirrored)
         surface["material"] = shape.material
         surface["shape"] = number
         surface["light"] = layout.CONSTANT["NO_LIGHT"]
-        surface["ng"] = _front_normals(surface, mirrored=determinant < 0)
-        surface["offset"] = layout.OFFSET_EPSILON * _extent(surface)
         positions.append(corners.reshape(-1, 9))
         surfaces.append(surface)
         cut_out.append(np.full(len(corners), is_cut_out(material, mesh)))
@@ -155,14 +156,13 @@ def flatten(scene: Scene, densities: bool = True) -> Geometry:
             tangents.append(record)
 
     def joined(parts: list[np.ndarray], dtype: np.dtype, width: tuple[int, ...] = ()) -> np.ndarray:
+        if len(parts) == 1:
+            return parts[0]
         return np.concatenate(parts) if parts else np.zeros((0, *width), dtype)
 
     second = any(texture.uv_set for texture in scene.textures)
     points = joined(positions, np.dtype(np.float32), (9,))
-    finite = points[np.isfinite(points).all(axis=1)].reshape(-1, 3).astype(np.float64)
-    low, high = (
-        (finite.min(axis=0), finite.max(axis=0)) if len(finite) else (np.zeros(3), np.zeros(3))
-    )
+    low, high = _bounds(points)
     return Geometry(
         points,
         joined(surfaces, layout.SURFACE.dtype),
@@ -253,20 +253,56 @@ def derived_tangents(mesh: Mesh, uvs: np.ndarray) -> list[np.ndarray]:
     return [np.column_stack([sums[keys[:, corner]], sign]) for corner in range(3)]
 
 
+def _runs(count: int) -> Iterator[slice]:
+    """Yield slices of rows whose intermediate results stay in a processor's cache."""
+    for start in range(0, count, RUN):
+        yield slice(start, start + RUN)
+
+
+def _set_triangles(surface: np.ndarray, corners: np.ndarray, mirrored: bool) -> None:
+    """Set all of layout.SURFACE that follows from the corners, ``(n, 3, 3)``."""
+    with np.errstate(all="ignore"):
+        surface["p0"] = corners[:, 0]
+        surface["e1"] = corners[:, 1] - corners[:, 0]
+        surface["e2"] = corners[:, 2] - corners[:, 0]
+    surface["ng"] = _front_normals(surface, mirrored)
+    surface["offset"] = layout.OFFSET_EPSILON * _extent(surface)
+
+
+def _bounds(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the box of the triangles ``(n, 9)`` whose corners are finite; zeros without one."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for rows in _runs(len(points)):
+        finite = points[rows][_all_finite(points[rows])].reshape(-1, 3)
+        if len(finite):
+            low = np.minimum(low, finite.min(axis=0))
+            high = np.maximum(high, finite.max(axis=0))
+    return (low, high) if (low <= high).all() else (np.zeros(3), np.zeros(3))
+
+
 def _front_normals(surface: np.ndarray, mirrored: bool) -> np.ndarray:
     """Return unit normals ``(n, 3)``; (0, 0, 1) for triangles without area."""
     with np.errstate(all="ignore"):
         normal = np.cross(surface["e1"].astype(np.float64), surface["e2"].astype(np.float64))
         normal /= np.linalg.norm(normal, axis=1, keepdims=True) * (-1.0 if mirrored else 1.0)
-    normal[~np.isfinite(normal).all(axis=1)] = (0.0, 0.0, 1.0)
+    normal[~_all_finite(normal)] = (0.0, 0.0, 1.0)
     return normal
+
+
+def _all_finite(rows: np.ndarray) -> np.ndarray:
+    """Return which rows of ``(n, c)`` are finite, ``(n,)``; NumPy is slow along a short axis."""
+    finite = np.isfinite(rows[:, 0])
+    for column in rows.T[1:]:
+        finite &= np.isfinite(column)
+    return finite
 
 
 def _extent(surface: np.ndarray) -> np.ndarray:
     """Return the largest coordinate that a point of each triangle is made of, ``(n,)``."""
     parts = (np.abs(surface[name]).astype(np.float64) for name in ("p0", "e1", "e2"))
     with np.errstate(all="ignore"):
-        extent = sum(parts).max(axis=1)
+        x, y, z = sum(parts).T
+        extent = np.maximum(np.maximum(x, y), z)
     return np.where(np.isfinite(extent), extent, 0.0)
 
 
