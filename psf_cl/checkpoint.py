@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from psf_cl.state_file import read_state, write_state
+from psf_cl.scheduler import MAX_PASSES
+from psf_cl.soundness import fault_of_tables
+from psf_cl.state_file import read_state, refuse_fault, write_state
 
-_KIND = "checkpoint"
+KIND = "checkpoint"
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ def write_checkpoint(path: str | os.PathLike[str], checkpoint: Checkpoint) -> No
         "seconds": checkpoint.seconds,
         "device": checkpoint.device,
     }
-    write_state(path, _KIND, header, checkpoint.buffers)
+    write_state(path, KIND, header, checkpoint.buffers)
 
 
 def read_checkpoint(
@@ -65,9 +67,11 @@ def read_checkpoint(
         buffers: name to type and number of items.
 
     Raises:
-        InputError: no checkpoint, a damaged one, or one of another render; the message says which.
+        InputError: no checkpoint, a damaged or unsound one, or one of another render; the message
+            says which.
     """
-    header, contents = read_state(path, _KIND, identity, buffers, _is_sound)
+    header, contents = read_state(path, KIND, identity, buffers, _is_sound)
+    refuse_fault(path, KIND, fault_of_tables(contents))
     first, end = header["epoch"]
     return Checkpoint(
         identity, header["passes"], (first, end), header["seconds"], header["device"], contents
@@ -81,7 +85,7 @@ def _is_sound(header: Mapping[str, Any]) -> bool:
     return (
         isinstance(header.get("device"), str)
         and len(counts) == 3
-        and all(type(count) is int and 0 <= count <= 1 << 32 for count in counts)
+        and all(type(count) is int and 0 <= count <= MAX_PASSES for count in counts)
         and isinstance(seconds, (int, float))
         and 0.0 <= seconds < 1e12
         and counts[1] <= counts[0] <= counts[2]

@@ -18,7 +18,7 @@ import numpy as np
 
 from psf_cl import __version__, learned, motion, tables
 from psf_cl.chains import Chains
-from psf_cl.checkpoint import Checkpoint, read_checkpoint, write_checkpoint
+from psf_cl.checkpoint import KIND, Checkpoint, read_checkpoint, write_checkpoint
 from psf_cl.device import layout
 from psf_cl.device.builders import Wanted, build_programs, builders_for
 from psf_cl.device.bvh import MIN_STACK_SIZE, Bvh, Refit, build_bvh, warm_up_builder
@@ -44,6 +44,7 @@ from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Scene
 from psf_cl.scheduler import MAX_PASSES, Hooks, Progress, Scheduler, doubling_epoch, longest_epoch
 from psf_cl.settings import Settings, resolve
+from psf_cl.soundness import fault_of_render
 from psf_cl.stages import (
     cache,
     cell_history,
@@ -60,6 +61,7 @@ from psf_cl.stages import (
     temporal,
     virtual_lights,
 )
+from psf_cl.state_file import refuse_fault
 from psf_cl.stats import statistics_of
 
 #: Looks of the host at the counters for each count of the paths by depth, which takes 0.4 ms on two
@@ -548,9 +550,10 @@ class Renderer:
         render that never stopped (on the same device).
 
         Raises:
-            InputError: the file is no checkpoint, is damaged, or is of another render.
+            InputError: the file is no checkpoint, is damaged or unsound, or is of another render.
         """
         state = read_checkpoint(path, self.identity, self._lasting())
+        refuse_fault(path, KIND, self._fault_of(state))
         counters = state.buffers["counters"]
         index = layout.COUNTER_INDEX
         # What was on its way has to start again.
@@ -565,6 +568,22 @@ class Renderer:
             self._guide(False, state.passes)
         if state.device != self.device.name:
             self.other_device = state.device
+
+    def _fault_of(self, state: Checkpoint) -> str | None:
+        """Return why this render cannot go on from a checkpoint that claims to be its own."""
+        start, end = state.epoch
+        guide_off = state.buffers["counters"][layout.COUNTER_INDEX["guide_off"]] == 1
+        if not self.plan.in_epochs or (guide_off and end == MAX_PASSES):
+            ends = MAX_PASSES
+        else:
+            ends = self._epoch_end(start) if state.passes else 0
+        if end != ends:
+            return "its epoch is none of this render"
+        groups = self.buffers.get("light_groups")
+        nodes = None if groups is None else self.device.read(groups)["node"]
+        return fault_of_render(
+            state.buffers, self.params[0], self.plan.traits.block, state.passes, nodes
+        )
 
     def save_cache(self, path: str | os.PathLike[str]) -> None:
         """Write what guide and radiance cache have learned, for renders from other places.

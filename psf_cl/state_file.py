@@ -94,6 +94,16 @@ def damaged(path: str | os.PathLike[str], kind: str) -> InputError:
     return InputError(f"{path}: damaged or truncated {kind}; {_WAYS[kind]}")
 
 
+def refuse_fault(path: str | os.PathLike[str], kind: str, fault: str | None) -> None:
+    """Refuse a file with a ``fault`` in what it holds, if there is one.
+
+    Raises:
+        InputError: there is.
+    """
+    if fault is not None:
+        raise InputError(f"{path}: unsound {kind}: {fault}; {_WAYS[kind]}")
+
+
 def _magic(kind: str) -> bytes:
     return f"psf_cl {kind} 1\n".encode()
 

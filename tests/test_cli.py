@@ -710,6 +710,16 @@ class Report:
             1,
             ["64 MiB", "fix: take another device with --device, or give this one more"],
         ),
+        (
+            [Report(ok=False, reason="cannot compile: error in <pyopencl.Device 'some'>")],
+            1,
+            ["fix: unset what changes how the driver compiles"],
+        ),
+        (
+            [Report(device="none", ok=False, reason="this platform has no device")],
+            1,
+            ["Some platform: none: this platform has no device", "fix: unset what hides"],
+        ),
         ([], 1, ["no OpenCL device can be used", "fix: install"]),
         (DeviceError("OpenCL does not start: No module named 'pyopencl'"), 1, ["pip install"]),
     ],

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import resource
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
+import pyopencl as cl
 import pytest
 from scene_builder import build, camera, floor, glowing, renderer
 
@@ -18,6 +23,7 @@ from psf_cl.settings import Settings
 
 LIGHT = transform.translation((0, 2.5, 0)) @ transform.rotation_xyz_degrees((180, 0, 0))
 GIB = 1 << 30
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def scene(size=(24, 16), columns=12):
@@ -116,6 +122,41 @@ def test_a_device_that_has_no_room_gets_a_smaller_pool_and_shows_the_same_image(
         with pytest.raises(DeviceError, match="in one buffer; a smaller --size"):
             renderer(device, few)
     assert device.allocated_bytes == before
+
+
+def test_a_driver_that_fails_to_allocate_is_told_of_at_once(device, monkeypatch):
+    """Whatever the driver says: by its own code, and with nothing left behind."""
+    before = device.allocated_bytes
+
+    def failing(self, size):
+        raise cl.MemoryError("create_buffer", cl.status_code.OUT_OF_HOST_MEMORY, "")
+
+    monkeypatch.setattr(Device, "memory", failing)
+    with pytest.raises(DeviceError, match=r"failed at allocating .* a smaller --size") as told:
+        renderer(device, scene(columns=6))
+    assert "\n" not in str(told.value)
+    assert device.allocated_bytes == before
+
+
+@pytest.mark.slow
+def test_a_process_without_memory_ends_by_one_line(device, tmp_path):
+    """A real limit: drivers that allocate on first use would end the process by a signal."""
+    command = [sys.executable, "-m", "psf_cl", "render", str(ROOT / "scenes/cornell_box.toml")]
+    command += "--preset psf --size 1200x1200 --spp 1 --quiet -o".split()
+    command.append(str(tmp_path / "out.exr"))
+    for mebibytes in (600, 800, 1000, 1500):
+        done = subprocess.run(
+            command,
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            preexec_fn=lambda size=mebibytes: resource.setrlimit(
+                resource.RLIMIT_AS, (size << 20, size << 20)
+            ),
+        )
+        assert done.returncode in (0, 1), (mebibytes, done.stderr)
+        lines = [line for line in done.stderr.splitlines() if line.startswith("psf-cl: error")]
+        assert len(lines) == done.returncode, done.stderr
 
 
 def test_memory_is_limited_by_an_option(tmp_path, monkeypatch, capsys):

@@ -7,6 +7,7 @@ import sys
 import types
 from pathlib import Path
 
+import pyopencl as cl
 import pytest
 
 from psf_cl.device import selftest
@@ -66,7 +67,32 @@ def test_a_wrong_result_fails_the_self_test(device, monkeypatch, right, wrong, p
 def test_a_compiler_error_is_one_line(device, monkeypatch):
     monkeypatch.setattr(selftest, "_SOURCE", selftest._SOURCE.replace("fma(", "no_such_function("))
     reason = selftest.run_self_test(device.cl_device)
-    assert reason and "\n" not in reason
+    assert reason.startswith("cannot compile: ") and "no_such_function" in reason
+    assert "\n" not in reason
+
+
+def test_the_doctor_compiles_anew_for_a_cache_hides_a_broken_compiler(device, monkeypatch):
+    asked = []
+
+    def build(program, options=(), **others):
+        asked.append(tuple(options))
+        raise cl.RuntimeError("build failed\nx.c:1: error: no such thing\nmore")
+
+    monkeypatch.setattr(cl.Program, "build", build)
+    for _ in range(2):
+        reason = selftest.run_self_test(device.cl_device, anew=True)
+        assert reason == "cannot compile: x.c:1: error: no such thing"
+    selftest.run_self_test(device.cl_device)
+    selftest.run_self_test(device.cl_device)
+    assert len(set(asked)) == 3
+
+
+def test_a_platform_without_a_device_is_reported(fake_python):
+    names = '{"platform": "P", "device": "none", "driver": "1"}'
+    fake_python("exit 9", listing=f"echo '[[0, null, {names}]]'")
+    (report,) = selftest.probe_devices()
+    assert (report.ok, report.platform) == (False, "P")
+    assert report.reason == "this platform has no device"
 
 
 def test_a_crashing_driver_is_reported(fake_python):
@@ -109,6 +135,11 @@ def test_drivers_that_cannot_be_loaded_are_named_with_the_fix(monkeypatch, tmp_p
     assert "gone.icd names libof_nobody.so, which does not load: libof_nobody.so: " in gone[0]
     assert gone[1] == f"install that driver again, or remove {tmp_path / 'gone.icd'}"
     assert "odd.icd names no library" in odd[0]
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(empty))
+    told = (f"OCL_ICD_VENDORS={empty} registers no driver", "unset OCL_ICD_VENDORS")
+    assert driver_problems() == [told]
     nowhere = tmp_path / "nowhere"
     monkeypatch.setenv("OCL_ICD_VENDORS", str(nowhere))
     told = (f"OCL_ICD_VENDORS={nowhere} is not there", "unset OCL_ICD_VENDORS")

@@ -19,12 +19,11 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # A module imports its own row and lower ones; "" is `import psf_cl`.
 ROWS = [
-    {"errors", "files", "settings", "traits", "image", "state_file", "__version__", ""}
-    | {"checkpoint", "learned"},
+    {"errors", "files", "settings", "traits", "image", "state_file", "__version__", ""},
     {"scene", "measure"},
     {"device"},
     {"stages", "few", "tables", "whole_lights", "instancing", "motion", "mover"},
-    {"chains", "plan", "scheduler"},
+    {"chains", "plan", "scheduler", "soundness", "checkpoint", "learned"},
     {"renderer", "pictures", "stats"},
     {"cli"},
     {"__init__", "__main__"},

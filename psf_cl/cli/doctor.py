@@ -19,14 +19,24 @@ _PACKAGES = ("numpy", "pyopencl", "OpenEXR", "pillow", "rich", "trimesh")
 # What the text of a failure contains, and the way out; the first that fits.  {driver} is the
 # command that installs PoCL on this system.
 _FIXES = (
+    (
+        "cannot compile",
+        "unset what changes how the driver compiles (such as POCL_EXTRA_BUILD_FLAGS); see that the "
+        "disk of its cache has room (~/.cache, POCL_CACHE_DIR); else update it: {driver}",
+    ),
     ("pyopencl", "install the Python binding: pip install pyopencl"),
     ("libOpenCL", "install an OpenCL loader and a driver: {driver}"),
     (
         "crashed",
-        "the driver is broken or too old for this processor: update it, or take another device "
-        "with --device; for PoCL: {driver}",
+        "the driver is broken, lacks the compiler or linker that it calls, or is too old for this "
+        "processor: update it, or take another device with --device; for PoCL: {driver}",
     ),
     ("no answer", "the driver hangs: update it, or take another device with --device"),
+    (
+        "no device",
+        "unset what hides its devices (such as POCL_DEVICES); PoCL needs a cache that it can write "
+        "(POCL_CACHE_DIR, ~/.cache); of a graphics card, see that you may open it (ls -l /dev/dri)",
+    ),
     (
         "too little memory",
         "take another device with --device, or give this one more (a virtual machine's setting, "

@@ -144,10 +144,12 @@ class Device:
             cl.Error: the driver has none.
         """
         flags = cl.mem_flags.READ_WRITE
+        # PoCL allocates on first use, where failing ends the process; but this at once.
+        at_once = flags | cl.mem_flags.ALLOC_HOST_PTR if self.traits.kind == "cpu" else flags
         if not self.guard_bytes:
-            return cl.Buffer(self.context, flags, size)
+            return cl.Buffer(self.context, at_once, size)
         origin = self._header_bytes
-        whole = cl.Buffer(self.context, flags, origin + size + self.guard_bytes)
+        whole = cl.Buffer(self.context, at_once, origin + size + self.guard_bytes)
         header = header_of(size)
         cl.enqueue_copy(self.queue, whole, header, dst_offset=origin - header.nbytes)
         return whole.get_sub_region(origin, size + self.guard_bytes, flags)

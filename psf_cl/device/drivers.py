@@ -29,7 +29,9 @@ def driver_problems() -> list[tuple[str, str]]:
             folder = Path(value)
             if not folder.exists():
                 problems.append((f"{variable}={value} is not there", f"unset {variable}"))
-    files = [folder] if folder.is_file() else sorted(folder.glob("*.icd"))
+            elif not _registered(folder):
+                problems.append((f"{variable}={value} registers no driver", f"unset {variable}"))
+    files = _registered(folder)
     for file in files:
         if file.suffix != ".icd":
             continue
@@ -43,6 +45,11 @@ def driver_problems() -> list[tuple[str, str]]:
             what = f"{file} names {library or 'no library'}, which does not load: {failure}"
             problems.append((what, f"install that driver again, or remove {file}"))
     return problems
+
+
+def _registered(place: Path) -> list[Path]:
+    """Return the files that register drivers."""
+    return [place] if place.is_file() else sorted(place.glob("*.icd"))
 
 
 def _load_failure(library: str) -> str:

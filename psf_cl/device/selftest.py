@@ -28,6 +28,8 @@ PROBE_SECONDS = 120.0
 #: Memory that small pictures of small scenes take.
 LEAST_BYTES = 128 << 20
 
+_NO_DEVICE = "this platform has no device"
+
 _GROUP = 64
 _BINS = 13
 _SOURCE = """
@@ -87,12 +89,16 @@ class DeviceReport:
     seconds: float
 
 
-def run_self_test(device: cl.Device, context: cl.Context | None = None) -> str | None:
+def run_self_test(
+    device: cl.Device, context: cl.Context | None = None, anew: bool = False
+) -> str | None:
     """Run the kernel on ``device`` in this process; return one line on what is wrong, else None.
 
     Args:
         context: to run in, if it is to be used afterwards: PoCL takes most of a second to get ready
             for the first program that it compiles in a context.
+        anew: compile even if the driver has the program in a cache, which hides that its compiler
+            no longer works.
     """
     import pyopencl as cl
 
@@ -119,7 +125,11 @@ def run_self_test(device: cl.Device, context: cl.Context | None = None) -> str |
             context, flags.READ_WRITE | flags.COPY_HOST_PTR, hostbuf=histogram
         )
         sums_buffer = cl.Buffer(context, flags.WRITE_ONLY, group_sums.nbytes)
-        program = cl.Program(context, _SOURCE).build(options=["-cl-std=CL1.2"])
+        options = ["-cl-std=CL1.2"] + [f"-DRUN={time.time_ns()}"] * anew
+        try:
+            program = cl.Program(context, _SOURCE).build(options=options, cache_dir=False)
+        except cl.RuntimeError as error:
+            return _one_line(f"cannot compile: {_complaint(str(error))}")
         kernel = cl.Kernel(program, "self_test")
         kernel.set_args(x_buffer, y_buffer, histogram_buffer, sums_buffer, np.uint32(count))
         cl.enqueue_nd_range_kernel(queue, kernel, (group_count * _GROUP,), (_GROUP,))
@@ -161,6 +171,9 @@ def probe_devices() -> list[DeviceReport]:
         raise DeviceError(f"OpenCL does not start: {failure}")
     reports = []
     for platform_index, device_index, names in listed:
+        if device_index is None:
+            reports.append(DeviceReport(**names, ok=False, reason=_NO_DEVICE, seconds=0.0))
+            continue
         answer, failure = _child(str(platform_index), str(device_index))
         if answer is None:
             answer = {**names, "ok": False, "reason": failure, "seconds": 0.0}
@@ -187,11 +200,19 @@ def _child(*arguments: str) -> tuple[Any, str]:
     return json.loads(lines[-1]), ""
 
 
+def _complaint(log: str) -> str:
+    """Return the line of a compiler's log that says most."""
+    lines = [line.strip() for line in log.splitlines() if line.strip()]
+    complaints = [line for line in lines if "error:" in line.lower()]
+    return (complaints or lines or ["it does not say why"])[0]
+
+
 def _one_line(text: str) -> str:
     return " ".join(text.split())[:300]
 
 
-def _devices() -> list[tuple[int, int, cl.Device]]:
+def _listed() -> list[tuple[int, int | None, dict[str, str]]]:
+    """Return indices and names of all devices; no index of one where a platform has none."""
     import pyopencl as cl
 
     try:
@@ -203,8 +224,11 @@ def _devices() -> list[tuple[int, int, cl.Device]]:
         try:
             devices = platform.get_devices()
         except cl.Error:  # A platform without a device says so by an error.
-            continue
-        found += [(platform_index, index, device) for index, device in enumerate(devices)]
+            devices = []
+        found += [(platform_index, index, _names(device)) for index, device in enumerate(devices)]
+        if not devices:
+            names = {"platform": platform.name, "device": "none", "driver": platform.version}
+            found.append((platform_index, None, names))
     return found
 
 
@@ -223,13 +247,15 @@ def main(arguments: list[str]) -> int:
         arguments: empty; the child processes are told ``--list`` or platform and device index.
     """
     if arguments == ["--list"]:
-        print(json.dumps([(p, index, _names(device)) for p, index, device in _devices()]))
+        print(json.dumps(_listed()))
         return 0
     if arguments:
-        wanted = tuple(int(argument) for argument in arguments)
-        device = next(device for p, index, device in _devices() if (p, index) == wanted)
+        import pyopencl as cl
+
+        platform_index, index = (int(argument) for argument in arguments)
+        device = cl.get_platforms()[platform_index].get_devices()[index]
         start = time.perf_counter()
-        reason = run_self_test(device)
+        reason = run_self_test(device, anew=True)
         seconds = time.perf_counter() - start
         answer = _names(device) | {"ok": reason is None, "reason": reason or "", "seconds": seconds}
         print(json.dumps(answer))
