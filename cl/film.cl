@@ -26,7 +26,8 @@ static inline void add_sample(FilmSum *sum, float4 sample)
     sum->mean += delta / (float)sum->count;
     const float more = delta * (y - sum->mean) - sum->lost_squares;
     const float squares = min(sum->squares + more, FLT_MAX);
-    sum->lost_squares = (squares - sum->squares) - more;
+    // A sum that is full has lost more than float can say.
+    sum->lost_squares = squares < FLT_MAX ? (squares - sum->squares) - more : 0.0f;
     sum->squares = squares;
 }
 

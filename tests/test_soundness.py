@@ -210,3 +210,20 @@ def test_an_unsound_checkpoint_is_one_line_and_the_code_of_bad_input(tmp_path, c
     error = capfd.readouterr().err
     assert error.count("\n") == 1
     assert "state: unsound checkpoint: film holds what is not finite" in error
+
+
+def test_the_brightest_light_that_a_scene_may_have_goes_on_from_its_checkpoint(device, tmp_path):
+    small = Device(device.context, replace(device.traits, slots=512))
+    # At the edges of the plate squares of differences are beyond float32.
+    bright = build([floor(0.5, glowing((1e20,) * 3))], camera((0, 1.5, 3), (0, 0, 0), 45), (12, 8))
+    with contextlib.ExitStack() as stack:
+        whole, first, second = (
+            stack.enter_context(contextlib.closing(renderer(small, bright))) for _ in range(3)
+        )
+        whole.render(spp=6)
+        first.render(spp=3)
+        assert first.save(tmp_path / "bright")
+        second.resume(tmp_path / "bright")
+        second.render(spp=6)
+        assert second.image().rgb.max() > 1e19
+        assert np.array_equal(second.image().rgb, whole.image().rgb)
