@@ -25,8 +25,8 @@ _RANGES = {
     ("guide_cells", "visits"): (0.0, np.inf),
 }
 
-#: Sums of samples, which cannot be more than there were passes.
-_COUNTED = ("film", "surfaces_seen")
+#: Records that count samples, which cannot be more than there were passes.
+_COUNTED = (layout.FILM_SUM.dtype, layout.SEEN_MEAN.dtype)
 
 _CHAIN_FLOATS = ("radiance_r", "radiance_g", "radiance_b", "independent", "lost")
 
@@ -70,9 +70,8 @@ def fault_of_render(
         nodes: uint32, those of the tree of lights that a photon can stand for.
     """
     for name, array in buffers.items():
-        if name.startswith(_COUNTED) and "count" in (array.dtype.names or ()):
-            if (array["count"] > passes).any():
-                return f"{name} counts more samples than there were passes"
+        if array.dtype in _COUNTED and (array["count"] > passes).any():
+            return f"{name} counts more samples than there were passes"
     guided = "guide_cells" in buffers
     if buffers["counters"][layout.COUNTER_INDEX["guide_off"]] > guided:
         return "counters leave out a guide that is not there"

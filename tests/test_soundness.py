@@ -25,7 +25,9 @@ TECHNIQUES = {
     "cache": {"termination": "cache"},
     "photons": {"light_sampling": "photon"},
     "chains": {"integrator": "metropolis", "chains": 128},
+    "cells": {"path_filter": "hash_grid"},
 }
+OUTPUTS = {"cells": ("cell_count", "variance", "normal")}
 
 
 def scene():
@@ -51,7 +53,9 @@ def saved(device, tmp_path_factory):
 
                 def fresh():
                     return stack.enter_context(
-                        contextlib.closing(renderer(small, scene(), **settings))
+                        contextlib.closing(
+                            renderer(small, scene(), OUTPUTS.get(name, ()), **settings)
+                        )
                     )
 
                 first, second = fresh(), fresh()
