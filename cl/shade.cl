@@ -522,7 +522,7 @@ kernel void shade_paths(
     turn.yt = dot3(bitangent, guide_t);
 #endif
     const Vec3 wo_local = vec3(dot3(tangent, wo), dot3(bitangent, wo), max(dot3(s.ns, wo), (Float)(1e-6f)));
-    const LobeChances chances = lobe_chances(b, wo_local.z);
+    const LobeChances chances = lobe_chances(b, wo_local);
 
 #if CELLS || BASE
     // Light is divided by the reflectance of the base before it is shared: textures stay sharp.

@@ -98,7 +98,7 @@ kernel void scatter_photons(
     Vec3 bitangent;
     make_frame(s.ns, &tangent, &bitangent);
     const Vec3 wo_local = vec3(dot3(tangent, wo), dot3(bitangent, wo), max(dot3(s.ns, wo), (Float)(1e-6f)));
-    const LobeChances chances = lobe_chances(b, wo_local.z);
+    const LobeChances chances = lobe_chances(b, wo_local);
     const UInt pair = PAIR_VERTEX + (bounce + 1u) * VERTEX_PAIRS;
     const UInt index = reverse_bits(number);
     const Seed seed = get_u(path, PATH_SEED);

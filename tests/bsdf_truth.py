@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
 
 
 @dataclass(frozen=True)
@@ -81,10 +82,11 @@ def schlick(f0, f90, cosine):
     return f0 + (f90 - f0) * (1 - np.clip(cosine, 0, 1)) ** 5
 
 
-def dielectric(b: Bsdf, cosine: np.ndarray) -> np.ndarray:
-    """Schlick where opaque, Fresnel where clear."""
+def dielectric(b: Bsdf, cosine: np.ndarray, raised: np.ndarray | float = 1.0) -> np.ndarray:
+    """Schlick where opaque, Fresnel where clear, which is raised; all of what cannot pass."""
     opaque = schlick(b.f0, b.specular, cosine)
-    clear = fresnel(cosine, b.eta) * b.specular
+    clear = fresnel(cosine, b.eta)
+    clear = clear * np.where(clear < 1, b.specular, 1.0) * raised
     return (1 - b.transmission) * opaque + b.transmission * clear
 
 
@@ -113,7 +115,7 @@ def eval_reflection(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
     metal = schlick(base, 1.0, cosine[..., None]) * (
         1 + base * metal_gain(b, wo[..., 2])[..., None]
     )
-    clear = dielectric(b, cosine) * glass_raise(b, wo[..., 2])
+    clear = dielectric(b, cosine, glass_raise(b, wo[..., 2]))
     f = (1 - b.metallic) * clear[..., None] + b.metallic * metal
     with np.errstate(all="ignore"):
         g = masking_shadowing(wo, wi, b.alpha)
@@ -121,40 +123,48 @@ def eval_reflection(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
     return np.where(wi[..., 2:] > 0, f * value[..., None], 0)
 
 
-# The renderer's fits, rows by the power of s; tests hold them against quadrature.
-MIRROR_FIT = [
-    (0.026616, -0.0581, -0.009742, 0.060876),
-    (-0.348857, 1.888125, 3.694314, -2.159958),
-    (2.78666, -9.259536, -7.005814, 8.277222),
-    (-2.504882, 12.704153, 27.23154, -26.873594),
-    (-0.09363, -6.105178, -15.355658, 18.573616),
-]
-EDGE_FIT = [
-    (-0.027605, 0.549456, 0.104114, 0.389766),
-    (0.000757, 1.614906, -1.508364, -0.885409),
-    (-2.518936, 7.571762, -12.173236, 8.51786),
-    (4.750035, -12.610544, 16.317993, -9.09099),
-]
+@cache
+def albedo_tables() -> dict[str, np.ndarray | float]:
+    """Return the renderer's fits and tables by name; tests hold them against quadrature."""
+    header = Path(__file__).resolve().parent.parent / "cl" / "common" / "albedo_tables.h"
+    text = header.read_text(encoding="utf-8")
+    found: dict[str, np.ndarray | float] = {
+        name: float(value) for name, value in re.findall(r"#define (\w+) ([-\d.e]+)f?$", text, re.M)
+    }
+    array = r"__constant \w+ (\w+?)((?:\[\d+\])+) = \{(.*?)\};"
+    for name, sizes, values in re.findall(array, text, re.S):
+        numbers = [float(v) for v in re.findall(r"-?\d[\d.]*(?:e-?\d+)?", values)]
+        shape = [int(n) for n in re.findall(r"\d+", sizes)]
+        found[name] = np.array(numbers).reshape(shape)
+    return found
 
 
 def polynomial(x, coefficients):
     return sum(c * x**k for k, c in enumerate(coefficients))
 
 
+def fitted(name: str, x: np.ndarray, y: np.ndarray | float) -> np.ndarray:
+    return sum(polynomial(y, row) * x**k for k, row in enumerate(albedo_tables()[f"{name}_FIT"]))
+
+
+def place_of_edge(alpha: float) -> float:
+    least = 1 / (1 + albedo_tables()["EDGE_SCALE"])
+    q = 1 / (1 + albedo_tables()["EDGE_SCALE"] * alpha)
+    return 2 * (q - least) / (1 - least) - 1
+
+
 def mirror_albedo(alpha: float, cosine: np.ndarray) -> np.ndarray:
     """Albedo of a white GGX mirror, rather too large."""
-    s = cosine / (cosine + alpha)
-    fit = sum(s**k * polynomial(alpha, row) for k, row in enumerate(MIRROR_FIT))
-    safe = 0.0047 + 0.014 * np.maximum(1 - 50 * cosine, 0)
-    return np.clip(1 - (1 - s) * fit + safe, 0.25, 1)
+    x = 2 * cosine * (1 + alpha) / (cosine + alpha) - 1
+    lost = alpha / (cosine + alpha) * fitted("MIRROR", x, 2 * alpha - 1)
+    return np.clip((1 - lost) * (1 + albedo_tables()["MIRROR_RAISED"]), 0.25, 1)
 
 
 def edge_albedo(alpha: float, cosine: np.ndarray) -> np.ndarray:
     """Albedo of GGX with a reflectance of (1 - cos)^5, rather too large."""
-    s = cosine / (cosine + alpha)
-    fit = sum(s**k * polynomial(1 / (1 + 8 * alpha), row) for k, row in enumerate(EDGE_FIT))
-    safe = 0.006 * (1 - cosine**4) + 0.014 * np.maximum(1 - 50 * cosine, 0)
-    return (1 - cosine) ** 5 * fit + safe
+    x = 2 * cosine * (1 + alpha) / (cosine + alpha) - 1
+    fit = fitted("EDGE", x, place_of_edge(alpha))
+    return (1 - cosine) ** 5 * fit + albedo_tables()["EDGE_RAISED"]
 
 
 def coat_albedo(b: Bsdf, cosine: np.ndarray) -> np.ndarray:
@@ -168,38 +178,33 @@ def metal_gain(b: Bsdf, cosine: np.ndarray) -> np.ndarray:
     return (1 - kept) / kept
 
 
-@cache
-def glass_table() -> np.ndarray:
-    """Return the renderer's table; tests hold it against what comes back of white light."""
-    header = Path(__file__).resolve().parent.parent / "cl" / "common" / "glass_table.h"
-    text = header.read_text(encoding="utf-8")
-    shape = [int(n) for n in re.findall(r"#define GLASS_(?:COSINES|ALPHAS|INDICES) (\d+)", text)]
-    entries = [int(n) for n in re.findall(r"\d+", text.split("{")[1])]
-    return np.array(entries, float).reshape(shape) / 255
+def looked_up(name: str, shape: str, *places: np.ndarray | float) -> np.ndarray:
+    """Return what a table has at ``places``, in [0, 1] along each axis, by SciPy."""
+    size = albedo_tables()[f"{shape}_SHAPE"].astype(int)
+    axes = [np.linspace(0, 1, n) for n in size]
+    table = albedo_tables()[f"{name}_TABLE"].reshape(size) / 65535
+    points = np.stack(np.broadcast_arrays(*places), axis=-1)
+    return RegularGridInterpolator(axes, table)(np.clip(points, 0, 1)).reshape(points.shape[:-1])
 
 
 def glass_raise(b: Bsdf, cosine: np.ndarray) -> np.ndarray:
-    """Return the factor of both lobes of solid glass, interpolated linearly along three axes."""
-    cosine = np.asarray(cosine, float)
+    """Return the factor of both lobes of solid glass."""
+    cosine = np.maximum(np.asarray(cosine, float), 0.0)
     if b.transmission == 0 or b.metallic == 1 or b.alpha <= 2e-3:
         return np.ones_like(cosine)
     x = (b.eta - 1) / (b.eta + 1)
     t = np.sign(x) * np.sqrt(min(abs(x) * 1.5, 1))
-    table = glass_table()
-    for place in ((t + 1) / 2, b.alpha):
-        at = min(place, 1) * (table.shape[-1] - 1)
-        first = min(int(at), table.shape[-1] - 2)
-        table = table[..., first] + (at - first) * (table[..., first + 1] - table[..., first])
-    along = cosine * (1 + b.alpha) / (cosine + b.alpha)
-    kept = np.maximum(np.interp(along, np.linspace(0, 1, len(table)), table), 0.05)
-    return 1 + (1 / kept - 1) * b.transmission * b.specular
+    along = np.sqrt(cosine * (1 + b.alpha) / (cosine + b.alpha))
+    places = (along, b.alpha**0.5, (t + 1) / 2)
+    kept = b.specular * looked_up("GLASS", "GLASS", *places)
+    kept = kept + (1 - b.specular) * looked_up("BARE_GLASS", "GLASS", *places)
+    return 1 / np.maximum(kept, 0.05)
 
 
 def average_coat_albedo(b: Bsdf) -> float:
     """The renderer's fit; a test holds it against the mean of coat_albedo."""
-    r, q = b.alpha**0.5, 1 / (1 + 8 * b.alpha)
-    mirror = polynomial(r, (1.006173, -0.043687, 0.676312, -3.377032, 2.783756, -0.631296))
-    edge = polynomial(q, (0.005262, -0.049972, 0.563542, -1.113004, 0.986581, -0.340664))
+    mirror = polynomial(2 * b.alpha**0.5 - 1, albedo_tables()["MIRROR_MEAN_FIT"][0])
+    edge = polynomial(place_of_edge(b.alpha), albedo_tables()["EDGE_MEAN_FIT"][0])
     return b.f0 * min(mirror, 1.0) + (b.specular - b.f0) * edge
 
 

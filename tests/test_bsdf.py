@@ -177,6 +177,10 @@ def test_chances_are_a_distribution_over_the_lobes_that_exist(lane_device):
     opaque = np.array([b.transmission < 1 and max(b.base_color) > 0 for b in bsdfs])
     # Under total reflection nothing reaches the base, but tilted facets still refract a little.
     total = np.array([truth.dielectric(b, o[2]) > 1 - 1e-5 for b, o in zip(bsdfs, wo, strict=True)])
+    cannot_pass = (
+        np.array([truth.fresnel(o[2], b.eta) for b, o in zip(bsdfs, wo, strict=True)]) == 1
+    )
+    coated |= dielectric & clear & cannot_pass
     exists = np.stack([coated, dielectric & clear, dielectric & opaque & ~total], axis=1)
     exists[:10] = False, False, True
     np.testing.assert_array_equal(chance > 0, exists)

@@ -271,7 +271,7 @@ def test_glass_boundary_reflects_and_refracts_what_quadrature_says(
     rough = bsdf_truth.Bsdf(roughness=roughness, transmission=1.0, entering=side > 0)
     truth *= bsdf_truth.glass_raise(rough, np.cos(angle))
     assert abs(seen - truth) < Z_LIMIT * noise + 1e-3 * truth
-    assert noise < 0.01
+    assert noise < 0.011
 
 
 @pytest.mark.parametrize("shape", ["smooth sphere", "faceted sphere", "box"])

@@ -12,10 +12,11 @@
 // GGX: Walter et al. 2007; height-correlated masking: Heitz 2014; sampled by its bounded visible
 // normals: Dupuy and Benyoub 2023, Eto and Tokuyoshi 2023.
 //
-// Scattering between facets: a metal's lobe is raised by 1 + F0 (1 - R(cos o)) / R(cos o), R the albedo
-// of a white one (Turquin: Practical Multiple Scattering Compensation for Microfacet Models, 2019), and
-// both lobes of glass by 1 / (what they leave of white light): of a sheet 1 / R, of a solid from
-// glass_table.h.  That gives up reciprocity, for no further lobe has to be drawn.
+// Scattering between facets: a metal's lobe is raised by 1 + F0 (1 - R(o)) / R(o), R the albedo of a
+// white one (Turquin: Practical Multiple Scattering Compensation for Microfacet Models, 2019), and both
+// lobes of glass by 1 / (what they leave of white light): of a sheet 1 / R, of a solid by a table.  That
+// gives up reciprocity, for no further lobe has to be drawn.  Light that can't leave a solid is
+// reflected, whatever the specular factor says.
 //
 // LAYERS: f = sheen + (1 - S(cos o)) (coat + (1 - C(cos o)) f), S and C the albedos of sheen and coat.
 // Sheen: Estevez and Kulla, Production Friendly Microfacet Sheen BRDF, 2017, with the visibility of
@@ -24,7 +25,7 @@
 
 #include "lanes.h"
 #include "surface.h"
-#include "glass_table.h"
+#include "albedo.h"
 
 // Below this a lobe is sharper than float can evaluate; roughness 0 is drawn with it.
 #define ALPHA_GGX_MIN 1e-3f
@@ -48,17 +49,16 @@ typedef struct {
     Float under_sheen;
 #endif
 #if GLOSSY
-    Float to_mirror[5]; // coefficients of mirror_albedo for this roughness
-    Float to_edge[4];   // and of edge_albedo
-    Float gain;         // what scattering between facets adds to a white mirror, relatively
-    Float enters;       // share of the light that comes to the diffuse base, over that which leaves it
+    Facets facets;
+    Float gain;   // what scattering between facets adds to a white mirror, relatively
+    Float enters; // share of the light that comes to the diffuse base, over that which leaves it
 #endif
 } LobeChances;
 
 #if !GLOSSY
 // Nothing but the base: a scene of matt materials.
 
-static inline LobeChances lobe_chances(Bsdf b, Float cos_o)
+static inline LobeChances lobe_chances(Bsdf b, Vec3 wo)
 {
     LobeChances c;
     c.diffuse = (Float)(1.0f);
@@ -94,13 +94,6 @@ static inline Vec3 sample_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Float u_lob
 }
 #else
 
-static inline Float fifth_power_of_one_minus(Float x)
-{
-    const Float y = max(1.0f - x, 0.0f);
-    const Float y2 = y * y;
-    return y2 * y2 * y;
-}
-
 static inline Float schlick(Float f0, Float f90, Float cosine)
 {
     return f0 + (f90 - f0) * fifth_power_of_one_minus(cosine);
@@ -120,99 +113,27 @@ static inline Float fresnel_dielectric(Float cosine, Float eta)
 }
 #endif
 
-/// Sum of c[k] x^k.
-static inline Float cubic(float c0, float c1, float c2, float c3, Float x)
+/// Part of the light that the rough coat of `b` reflects, of what white facets do.
+static inline Float coat_albedo(Bsdf b, Reflected r)
 {
-    return c0 + x * (c1 + x * (c2 + x * c3));
+    return min(b.f0 * r.white + (b.specular - b.f0) * r.edge, (Float)(1.0f));
 }
 
-// Fits to quadrature, as polynomials in s = cos / (cos + alpha), because a lobe near the horizon looks
-// the same for all alpha in it.  They err by 0.0055, and below a cosine of 0.02 by 0.018; that much is
-// added, for light must not be gained.
-
-/// Set up mirror_albedo for a roughness.
-static inline void fit_mirror(Float alpha, Float *c)
+/// Its cosine-weighted mean over the hemisphere, to 5e-4.
+static inline Float average_coat_albedo(Bsdf b, Float alpha)
 {
-    c[0] = cubic(0.026616f, -0.0581f, -0.009742f, 0.060876f, alpha);
-    c[1] = cubic(-0.348857f, 1.888125f, 3.694314f, -2.159958f, alpha);
-    c[2] = cubic(2.78666f, -9.259536f, -7.005814f, 8.277222f, alpha);
-    c[3] = cubic(-2.504882f, 12.704153f, 27.23154f, -26.873594f, alpha);
-    c[4] = cubic(-0.09363f, -6.105178f, -15.355658f, 18.573616f, alpha);
-}
-
-/// Part of the light that a white GGX mirror reflects, without scattering between facets.
-static inline Float mirror_albedo(const Float *c, Float s, Float cosine)
-{
-    const Float lost = (1.0f - s) * (c[0] + s * (c[1] + s * (c[2] + s * (c[3] + s * c[4]))));
-    const Float safe = 0.0047f + 0.014f * max(1.0f - 50.0f * cosine, 0.0f);
-    return clamp(1.0f - lost + safe, (Float)(0.25f), (Float)(1.0f));
-}
-
-/// Set up edge_albedo for a roughness.
-static inline void fit_edge(Float alpha, Float *c)
-{
-    const Float q = 1.0f / (1.0f + 8.0f * alpha);
-    c[0] = cubic(-0.027605f, 0.549456f, 0.104114f, 0.389766f, q);
-    c[1] = cubic(0.000757f, 1.614906f, -1.508364f, -0.885409f, q);
-    c[2] = cubic(-2.518936f, 7.571762f, -12.173236f, 8.51786f, q);
-    c[3] = cubic(4.750035f, -12.610544f, 16.317993f, -9.09099f, q);
-}
-
-/// Part of the light that GGX with a reflectance of (1 - cos)^5 reflects.
-static inline Float edge_albedo(const Float *c, Float s, Float cosine)
-{
-    const Float cos2 = cosine * cosine;
-    const Float safe = 0.006f * (1.0f - cos2 * cos2) + 0.014f * max(1.0f - 50.0f * cosine, 0.0f);
-    return fifth_power_of_one_minus(cosine) * (c[0] + s * (c[1] + s * (c[2] + s * c[3]))) + safe;
-}
-
-/// Part of the light from one direction that the rough coat of `b` reflects into all directions.
-static inline Float coat_albedo(Bsdf b, LobeChances c, Float cosine)
-{
-    const Float s = cosine / (cosine + b.alpha);
-    const Float mirror = b.f0 * mirror_albedo(c.to_mirror, s, cosine);
-    return min(mirror + (b.specular - b.f0) * edge_albedo(c.to_edge, s, cosine), (Float)(1.0f));
-}
-
-/// Cosine-weighted mean of coat_albedo over the hemisphere, to 5e-4.
-static inline Float average_coat_albedo(Bsdf b)
-{
-    const Float r = sqrt(b.alpha);
-    const Float q = 1.0f / (1.0f + 8.0f * b.alpha);
-    const Float mirror =
-        1.006173f + r * (-0.043687f + r * (0.676312f + r * (-3.377032f + r * (2.783756f - 0.631296f * r))));
-    const Float edge =
-        0.005262f + q * (-0.049972f + q * (0.563542f + q * (-1.113004f + q * (0.986581f - 0.340664f * q))));
+    const Float mirror = polynomial(MIRROR_MEAN_FIT[0], MEAN_TERMS, 2.0f * sqrt(alpha) - 1.0f);
+    const Float edge = polynomial(EDGE_MEAN_FIT[0], MEAN_TERMS, place_of_edge(alpha));
     return b.f0 * min(mirror, (Float)(1.0f)) + (b.specular - b.f0) * edge;
 }
 
 #if LAYERS
 #define COAT_F0 0.04f // of an index of 1.5
-#define SHEEN_ROUGHNESS_MIN 0.3f
-
 /// Part of the light that the clear coat reflects.
 static inline Float clear_coat_albedo(Float alpha, Float cosine)
 {
-    Float mirror[5];
-    Float edge[4];
-    fit_mirror(alpha, mirror);
-    fit_edge(alpha, edge);
-    const Float s = cosine / (cosine + alpha);
-    return COAT_F0 * mirror_albedo(mirror, s, cosine) + (1.0f - COAT_F0) * edge_albedo(edge, s, cosine);
-}
-
-/// What white sheen is scaled by, so that it nowhere reflects more than all: 1 from roughness 0.46 on.
-static inline Float sheen_scale(Float roughness) { return 1.0f / max(2.2f - 2.6f * roughness, (Float)(1.0f)); }
-
-/// Part of the light that white sheen reflects: a fit that errs by 0.02, which is added.
-static inline Float sheen_albedo(Float r, Float cosine)
-{
-    const Float s = cosine / (cosine + 0.3f);
-    const Float fit = cubic(3.085667f, -8.272625f, 9.952519f, -4.147989f, r)
-                      + s * (cubic(-7.221783f, 22.27487f, -27.769791f, 11.896124f, r)
-                             + s * (cubic(-1.031894f, 11.75999f, -14.565635f, 5.446236f, r)
-                                    + s * cubic(6.807946f, -35.550146f, 46.061533f, -19.107999f, r)));
-    return clamp((fit + 0.02f) * sheen_scale(r), (Float)(0.0f), (Float)(1.0f));
+    const Reflected r = reflected_by(facets_of(alpha), cosine);
+    return COAT_F0 * r.white + (1.0f - COAT_F0) * r.edge;
 }
 
 /// White sheen times cos i, without its scale.
@@ -225,84 +146,60 @@ static inline Float eval_sheen(Float roughness, Float cos_o, Float cos_i, Float 
 }
 #endif
 
-/// Reflectance of the dielectric part of `b`, where its opaque share reflects `opaque`.
-static inline Float dielectric_reflectance(Bsdf b, Float opaque, Float cosine)
+/// Reflectance of the dielectric part of `b`, where its opaque share reflects `opaque` and its clear one
+/// is raised.
+static inline Float dielectric_reflectance(Bsdf b, Float opaque, Float cosine, Float raised)
 {
 #if TRANSMISSION
     Float clear = fresnel_dielectric(max(cosine, 1e-6f), b.eta);
-    // Between the two faces of a sheet light goes to and fro.
-    clear = pick(b.thin, 2.0f * clear / (1.0f + clear), clear) * b.specular;
-    return opaque + (clear - opaque) * b.transmission;
+    // Between the two faces of a sheet light goes to and fro.  What can't leave a solid is reflected.
+    const Mask total = (clear >= 1.0f) & !b.thin;
+    clear = pick(b.thin, 2.0f * clear / (1.0f + clear), clear) * pick(total, (Float)(1.0f), b.specular);
+    return opaque + (clear * raised - opaque) * b.transmission;
 #else
     return opaque;
 #endif
 }
 
-#if TRANSMISSION
-/// Part of white light that one bounce on rough solid glass leaves, never too little; 1 in other lanes.
-static inline Float glass_albedo(Mask wanted, Float alpha, Float eta, Float cosine)
-{
-    const Float x = (eta - 1.0f) / (eta + 1.0f);
-    const Float t = sqrt(min(fabs(x) * (1.0f / GLASS_LARGEST), (Float)(1.0f)));
-    const Float place[3] = {
-        clamp(cosine * (1.0f + alpha) / (cosine + alpha), (Float)(0.0f), (Float)(1.0f)) * (GLASS_COSINES - 1.0f),
-        alpha * (GLASS_ALPHAS - 1.0f), (0.5f + pick(x < 0.0f, -0.5f * t, 0.5f * t)) * (GLASS_INDICES - 1.0f)};
-    float lane_place[3][W];
-    float lane_value[W];
-    for (uint axis = 0; axis < 3; ++axis)
-        store_lanes(place[axis], lane_place[axis]);
-    store_lanes((Float)(1.0f), lane_value);
-    for (uint left = lane_bits(wanted); left; left &= left - 1u) {
-        const uint k = lowest_bit(left);
-        // Not a number becomes 0 here: no index leaves the table.
-        const float3 at = fmax((float3)(lane_place[0][k], lane_place[1][k], lane_place[2][k]), 0.0f);
-        const uint3 most = (uint3)(GLASS_COSINES - 2, GLASS_ALPHAS - 2, GLASS_INDICES - 2);
-        const uint3 first = min(convert_uint3(at), most);
-        const float3 part = fmin(at - convert_float3(first), 1.0f);
-        float sum[4];
-        for (uint corner = 0; corner < 4; ++corner) {
-            __constant uchar *row =
-                GLASS_TABLE + ((first.x + (corner >> 1)) * GLASS_ALPHAS + first.y + (corner & 1u)) * GLASS_INDICES + first.z;
-            sum[corner] = mix((float)row[0], (float)row[1], part.z);
-        }
-        lane_value[k] = mix(mix(sum[0], sum[1], part.y), mix(sum[2], sum[3], part.y), part.x) * (1.0f / 255.0f);
-    }
-    return max(load_lanes(lane_value), 0.05f);
-}
-#endif
-
-LARGE_FUNCTION LobeChances lobe_chances(Bsdf b, Float cos_o)
+LARGE_FUNCTION LobeChances lobe_chances(Bsdf b, Vec3 wo)
 {
     LobeChances c;
-    fit_mirror(b.alpha, c.to_mirror);
-    fit_edge(b.alpha, c.to_edge);
-    const Float kept = mirror_albedo(c.to_mirror, cos_o / (cos_o + b.alpha), cos_o);
-    c.gain = (1.0f - kept) / kept;
+    const Float cos_o = wo.z;
 #if LAYERS
-    // The fit is of equal roughness; stretched highlights are raised less, rather than too much.
-    c.gain *= min(b.alpha, b.alpha_y) / max(b.alpha, b.alpha_y);
+    // Light leaves the base through stretched facets as through round ones: that loses nothing.
+    const Mask stretched = b.alpha != b.alpha_y;
+    const Float alpha = pick(stretched, sqrt(b.alpha * b.alpha_y), b.alpha);
+#else
+    const Float alpha = b.alpha;
+#endif
+    c.facets = facets_of(alpha);
+    Reflected seen = reflected_by(c.facets, cos_o);
+#if LAYERS
+    if (any_lane(stretched))
+        seen = reflected_by_stretched(stretched, b.alpha, b.alpha_y, wo, seen);
     c.under_sheen = 1.0f - max3(b.sheen) * sheen_albedo(b.sheen_roughness, cos_o);
     const Float coat = b.coat * clear_coat_albedo(b.coat_alpha, cos_o);
     c.under_coat = c.under_sheen * (1.0f - coat);
 #endif
-    const Float reflected = coat_albedo(b, c, cos_o);
-    c.enters = (1.0f - b.metallic) * (1.0f - reflected) / max(1.0f - average_coat_albedo(b), 1e-6f);
+    c.gain = (1.0f - seen.white) / seen.white;
+    const Float reflected = coat_albedo(b, seen);
+    c.enters = (1.0f - b.metallic) * (1.0f - reflected) / max(1.0f - average_coat_albedo(b, alpha), 1e-6f);
 #if TRANSMISSION
     c.enters *= 1.0f - b.transmission;
-    c.raised = 1.0f + pick(b.thin, c.gain, (Float)(0.0f)) * b.transmission;
+    c.raised = 1.0f + pick(b.thin, c.gain, (Float)(0.0f));
     const Mask rough = (b.transmission > 0.0f) & !b.thin & (b.metallic < 1.0f) & (b.alpha > 2.0f * ALPHA_GGX_MIN);
     if (any_lane(rough)) {
-        // Without its reflection glass loses other light than the table says.
+        Float kept = glass_albedo(rough, b.alpha, b.eta, b.specular, cos_o);
 #if LAYERS
-        const Float alpha = min(b.alpha, b.alpha_y);
-#else
-        const Float alpha = b.alpha;
+        // There is no table of two widths: what the better one keeps, rather than too little.
+        const Mask both = rough & stretched;
+        if (any_lane(both))
+            kept = max(kept, pick(both, glass_albedo(both, b.alpha_y, b.eta, b.specular, cos_o), kept));
 #endif
-        const Float kept = glass_albedo(rough, alpha, b.eta, cos_o);
-        c.raised = pick(rough, 1.0f + (1.0f / kept - 1.0f) * b.transmission * b.specular, c.raised);
+        c.raised = pick(rough, 1.0f / kept, c.raised);
     }
 #endif
-    const Float f = dielectric_reflectance(b, reflected, cos_o);
+    const Float f = dielectric_reflectance(b, reflected, cos_o, (Float)(1.0f));
     const Float color = max3(b.base_color);
     const Float metal_part = b.metallic * schlick(color, (Float)(1.0f), cos_o);
     const Float reflect = (1.0f - b.metallic) * f + metal_part;
@@ -465,7 +362,7 @@ static inline Float pdf_ggx_reflect(Vec3 wo, Vec3 h, Alphas alpha)
 /// Factor of the light in f cos of the diffuse base; that of wo is LobeChances.enters.
 static inline Float base_light(Bsdf b, LobeChances chances, Float cos_i)
 {
-    return (1.0f - coat_albedo(b, chances, cos_i)) * cos_i * INV_PI;
+    return (1.0f - coat_albedo(b, reflected_by(chances.facets, cos_i))) * cos_i * INV_PI;
 }
 
 /// Factor of wo of the diffuse base, beside its colour, under all that lies over it.
@@ -511,16 +408,18 @@ LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Flo
     const Float cos_h = clamp(dot3(wo, h), (Float)(0.0f), (Float)(1.0f));
 
     const Float edge = fifth_power_of_one_minus(cos_h);
-    const Float f = dielectric_reflectance(b, b.f0 + (b.specular - b.f0) * edge, cos_h);
+#if TRANSMISSION
+    const Float raised = chances.raised;
+#else
+    const Float raised = (Float)(1.0f);
+#endif
+    const Float f = dielectric_reflectance(b, b.f0 + (b.specular - b.f0) * edge, cos_h, raised);
     const Vec3 white = vec3_all((Float)(1.0f));
     Vec3 metal = add_scaled(b.base_color, sub(white, b.base_color), edge);
     metal = mul(metal, add_scaled(white, b.base_color, chances.gain));
     Vec3 coat = vec3_all(f);
 #if LAYERS
     coat = scale(add_scaled(b.tint, sub(white, b.tint), edge), f);
-#endif
-#if TRANSMISSION
-    coat = scale(coat, chances.raised);
 #endif
     const Vec3 fresnel = lerp3(coat, metal, b.metallic);
     const Float mirror = ggx_d(h, alpha) * ggx_visibility(wo, wi, cos_i, alpha) * cos_i;

@@ -33,9 +33,9 @@ static inline Bsdf load_bsdf(global const float *materials)
     return b;
 }
 
-static inline LobeChances load_chances(global const float *chances, Bsdf b, Float cos_o)
+static inline LobeChances load_chances(global const float *chances, Bsdf b, Vec3 wo)
 {
-    LobeChances c = lobe_chances(b, cos_o);
+    LobeChances c = lobe_chances(b, wo);
     const Mask given = LOAD(chances, 0) >= 0.0f;
 #if GLOSSY
     c.reflect = pick(given, LOAD(chances, 0), c.reflect);
@@ -52,7 +52,7 @@ static inline LobeChances load_chances(global const float *chances, Bsdf b, Floa
 
 kernel void list_chances(global const float *materials, global const float *wo, global float *chances)
 {
-    const LobeChances c = lobe_chances(load_bsdf(materials), LOAD(wo, 2));
+    const LobeChances c = lobe_chances(load_bsdf(materials), LOAD_V(wo, 0));
 #if GLOSSY
     STORE(chances, 0, c.reflect);
 #else
@@ -75,7 +75,7 @@ kernel void list_chances(global const float *materials, global const float *wo, 
 kernel void list_left_of_choice(
     global const float *materials, global const float *wo, global const float *numbers, global float *left)
 {
-    STORE(left, 0, left_of_choice(lobe_chances(load_bsdf(materials), LOAD(wo, 2)), LOAD(numbers, 0)));
+    STORE(left, 0, left_of_choice(lobe_chances(load_bsdf(materials), LOAD_V(wo, 0)), LOAD(numbers, 0)));
 }
 
 kernel void eval_pairs(
@@ -90,7 +90,7 @@ kernel void eval_pairs(
     const Bsdf b = load_bsdf(materials);
     const Vec3 o = LOAD_V(wo, 0);
     Float pdf;
-    store_vec3(values, 0, eval_bsdf(b, load_chances(given, b, o.z), o, LOAD_V(wi, 0), LOAD(side, 0), &pdf));
+    store_vec3(values, 0, eval_bsdf(b, load_chances(given, b, o), o, LOAD_V(wi, 0), LOAD(side, 0), &pdf));
     STORE(pdfs, 0, pdf);
 }
 
@@ -106,7 +106,7 @@ kernel void sample_directions(
 {
     const Bsdf b = load_bsdf(materials);
     const Vec3 o = LOAD_V(wo, 0);
-    const LobeChances c = load_chances(given, b, o.z);
+    const LobeChances c = load_chances(given, b, o);
     const Vec3 i = sample_bsdf(b, c, o, LOAD(numbers, 0), LOAD(numbers, 1), LOAD(numbers, 2));
     Float pdf;
     const Vec3 value = eval_bsdf(b, c, o, i, i.z, &pdf);

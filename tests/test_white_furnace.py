@@ -1,0 +1,122 @@
+"""White surfaces under a white sky: all that arrives comes back, and never more."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.stats import qmc
+from test_bsdf import direction
+from test_bsdf_layers import record, sample
+
+#: From straight above to 89 degrees from the normal.
+COSINES = (1.0, 0.7, 0.3, 0.1, 0.0175)
+ROUGHNESSES = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 1.0)
+WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+
+KINDS = {
+    "metal": {"metallic": 1.0},
+    "stretched metal": {"metallic": 1.0, "anisotropy": 0.6},
+    "most stretched metal": {"metallic": 1.0, "anisotropy": 1.0},
+    "dielectric": {},
+    "stretched dielectric": {"anisotropy": 0.8},
+    "glass": {"transmission": 1.0},
+    "glass from inside": {"transmission": 1.0, "entering": False},
+    "half clear": {"transmission": 0.5},
+    "half reflecting glass": {"transmission": 1.0, "specular": 0.5},
+    "bare glass from inside": {"transmission": 1.0, "specular": 0.0, "entering": False},
+    "sheet": {"transmission": 1.0, "thin": True},
+    "stretched sheet": {"transmission": 1.0, "thin": True, "anisotropy": 0.5},
+    "coated": {"coat": 1.0, "coat_roughness": 0.4},
+    "coated metal": {"coat": 0.5, "coat_roughness": 0.7, "metallic": 1.0},
+    "velvet": {"sheen": WHITE, "sheen_roughness": 0.3},
+    "fleece": {"sheen": WHITE, "sheen_roughness": 0.8},
+    "coated fleece": {"sheen": (0.5,) * 3, "coat": 1.0, "coat_roughness": 0.1},
+}
+
+
+def furnace(device, records, wo, count=2048, rounds=4):
+    """Return what comes back of white light, ``(n,)``, and how far that is known.
+
+    Power, not radiance: what passes into glass is multiplied with the square of the index.
+    """
+    means = []
+    for k in range(rounds):
+        numbers = qmc.Sobol(3, rng=np.random.default_rng(k)).random(count)
+        rows = np.repeat(records, count, axis=0)
+        wi, values, pdfs = sample(
+            device, rows, np.repeat(wo, count, axis=0), np.tile(numbers, (len(records), 1))
+        )
+        power = np.where((wi[:, 2] < 0) & (rows[:, 9] == 0), rows[:, 8] ** 2, 1.0)
+        weight = np.where(pdfs > 0, values[:, 0] / np.where(pdfs > 0, pdfs, 1), 0) * power
+        means.append(weight.astype(np.float64).reshape(len(records), count).mean(axis=1))
+    return np.mean(means, axis=0), np.std(means, axis=0, ddof=1) / np.sqrt(rounds)
+
+
+#: What may be lost where the tables are coarse: where most changes, and from inside.
+LOST = {
+    "most stretched metal": 0.015,
+    "stretched dielectric": 0.015,
+    "glass from inside": 0.02,
+    "bare glass from inside": 0.05,
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_white_conserves(device, kind):
+    turns = (0.0, 0.7, 1.5708) if "stretched" in kind else (0.7,)
+    cases = list(itertools.product(ROUGHNESSES, (1.3, 1.5, 2.4), COSINES, turns))
+    records = np.array([record(roughness=r, ior=n, **KINDS[kind]) for r, n, _, _ in cases])
+    wo = np.array([direction(cosine, turn) for _, _, cosine, turn in cases])
+    returned, deviation = furnace(device, records, wo, count=1024)
+    over = returned - 1.001 - 4 * deviation
+    assert over.max() < 0, (cases[over.argmax()], returned[over.argmax()])
+    under = 1 - LOST.get(kind, 0.01) - returned - 4 * deviation
+    assert under.max() < 0, (cases[under.argmax()], returned[under.argmax()])
+
+
+def grid_records(count):
+    """Return ``count`` records from the grid of all parameters, white, and what they are."""
+    rng = np.random.default_rng(8)
+    grid = {
+        "roughness": ROUGHNESSES,
+        "metallic": (0.0, 0.5, 1.0),
+        "transmission": (0.0, 0.5, 1.0),
+        "shape": ((True, False), (False, False), (True, True)),
+        "specular": (0.0, 0.5, 1.0),
+        "ior": (1.3, 1.5, 2.4),
+        "coat": (0.0, 0.5, 1.0),
+        "coat_roughness": (0.0, 0.3, 0.6, 1.0),
+        "sheen": (BLACK, (0.5,) * 3, WHITE),
+        "sheen_roughness": (0.3, 0.5, 0.7, 1.0),
+        "anisotropy": (0.0, 0.0, 0.3, 0.6, 1.0),
+    }
+    made = []
+    for _ in range(count):
+        row = {name: values[rng.integers(len(values))] for name, values in grid.items()}
+        entering, thin = row.pop("shape")
+        made.append(row | {"entering": entering, "thin": thin})
+    return made, np.array([record(**row) for row in made])
+
+
+@pytest.mark.parametrize("count", [300, pytest.param(6000, marks=pytest.mark.slow)])
+def test_no_combination_gains_or_loses_energy(device, count):
+    """Places of a grid over all parameters; stretched solid glass loses more, and is known to."""
+    made, records = grid_records(count)
+    rng = np.random.default_rng(9)
+    cosines = rng.choice(COSINES, count)
+    wo = np.array(
+        [direction(c, t) for c, t in zip(cosines, rng.uniform(0, 6.28, count), strict=True)]
+    )
+    returned, deviation = furnace(device, records, wo, count=1024)
+    over = returned - 1.001 - 5 * deviation
+    assert over.max() < 0, (made[over.argmax()], cosines[over.argmax()], returned[over.argmax()])
+    glass = np.array([row["transmission"] > 0 and not row["thin"] for row in made])
+    inside = glass & np.array([not row["entering"] for row in made])
+    stretched = np.array([row["anisotropy"] > 0 for row in made])
+    lost = np.where(inside, 0.05, np.where(stretched, 0.015, 0.01))
+    under = np.where(glass & stretched, -1, 1 - lost - returned - 5 * deviation)
+    assert under.max() < 0, (
+        made[under.argmax()],
+        cosines[under.argmax()],
+        returned[under.argmax()],
+    )
