@@ -21,13 +21,15 @@ from psf_cl.scene.model import Material
 
 TECHNIQUES = {
     "film": {},
-    "guide": {"guiding": "learned"},
-    "cache": {"termination": "cache"},
-    "photons": {"light_sampling": "photon"},
+    "tables": {
+        "path_filter": "hash_grid",
+        "guiding": "learned",
+        "termination": "cache",
+        "light_sampling": "photon",
+    },
     "chains": {"integrator": "metropolis", "chains": 128},
-    "cells": {"path_filter": "hash_grid"},
 }
-OUTPUTS = {"cells": ("cell_count", "variance", "normal")}
+OUTPUTS = {"tables": ("cell_count", "variance", "normal")}
 
 
 def scene():
@@ -138,16 +140,16 @@ CASES = {
         put(None, 1, layout.COUNTER_INDEX["guide_off"]),
         "a guide that is not there",
     ),
-    "densities": ("guide", "guide_cells", put("density", -1.0), "density of guide_cells is out"),
-    "rows": ("guide", "guide_cells", put("rows", np.nan), "guide_cells holds what is not finite"),
-    "sums": ("guide", "guide_sums", put("high", 1 << 31), "guide_sums holds sums that are too"),
-    "ends": ("cache", "cache_cells", put("ends", 2.0), "ends of cache_cells is out of range"),
-    "means": ("cache", "cache_cells", put("mean", np.inf), "cache_cells holds what is not finite"),
-    "long lists": ("photons", "particle_table", put_record(1, 15), "lists that are too long"),
-    "nodes": ("photons", "particle_table", put_record(4, 1 << 30), "table names lights"),
-    "shares": ("photons", "particle_table", put_record(18, NAN), "what is no chance"),
-    "chances": ("photons", "particle_table", put_record(2, NAN), "what is no chance"),
-    "photons": ("photons", "particle_words", put_words, "words name lights that are not"),
+    "densities": ("tables", "guide_cells", put("density", -1.0), "density of guide_cells is out"),
+    "rows": ("tables", "guide_cells", put("rows", np.nan), "guide_cells holds what is not finite"),
+    "sums": ("tables", "guide_sums", put("high", 1 << 31), "guide_sums holds sums that are too"),
+    "ends": ("tables", "cache_cells", put("ends", 2.0), "ends of cache_cells is out of range"),
+    "means": ("tables", "cache_cells", put("mean", np.inf), "cache_cells holds what is not finite"),
+    "long lists": ("tables", "particle_table", put_record(1, 15), "lists that are too long"),
+    "nodes": ("tables", "particle_table", put_record(4, 1 << 30), "table names lights"),
+    "shares": ("tables", "particle_table", put_record(18, NAN), "what is no chance"),
+    "chances": ("tables", "particle_table", put_record(2, NAN), "what is no chance"),
+    "photons": ("tables", "particle_words", put_words, "words name lights that are not"),
     "radiance": ("chains", "chains", put_chain("radiance_g", NAN), "chains hold what is not"),
     "numbers": ("chains", "chains", put_chain("pairs", 1 << 20), "than there is room for"),
     "pixels": ("chains", "chains", put_chain("pixel", 96), "pixels that are not there"),
@@ -176,9 +178,9 @@ def test_a_signed_checkpoint_of_what_no_render_writes_is_refused(saved, tmp_path
 @pytest.mark.parametrize("epoch", [(0, 1 << 31), (8, 9), (0, 8), (7, 8)])
 def test_an_epoch_that_is_not_one_of_the_render_is_refused(saved, tmp_path, epoch):
     path = tmp_path / "state"
-    path.write_bytes(forged(saved("photons"), {}, {"epoch": list(epoch)}))
+    path.write_bytes(forged(saved("tables"), {}, {"epoch": list(epoch)}))
     with pytest.raises(InputError, match="state: unsound checkpoint: its epoch is none of"):
-        saved("photons")[0].resume(path)
+        saved("tables")[0].resume(path)
 
 
 @pytest.mark.parametrize("technique", TECHNIQUES)
