@@ -35,6 +35,8 @@ def guarded(lane_device, monkeypatch):
         ("write_group", 0, "target"),
         ("gather_words_of_lanes", 7, "source"),
         ("gather_records", 1, "source"),
+        ("begin_inside", 7, "source"),
+        ("begin_group_inside", 1, "source"),
     ],
 )
 def test_the_first_index_behind_an_array_is_told_and_the_last_inside_is_not(
@@ -73,7 +75,7 @@ def test_a_checked_source_without_its_checks_is_the_source(path):
 
 def without_checks(text):
     """Return ``text`` with AT(array, index) and GROUP_AT(array, index, count) as the index."""
-    while match := re.search(r"\b(?:GROUP_)?AT\((\w+), ", text):
+    while match := re.search(r"\b(?:GROUP_)?AT\((?:\([^()]*\))?\w+, ", text):
         depth, end, comma = 1, match.end(), None
         while depth:
             depth += (text[end] in "([") - (text[end] in ")]")

@@ -1,10 +1,11 @@
 """Index assertions: sources whose accesses to device arrays are bound-checked, for debugging.
 
 A checked buffer has a header before its first item: a magic word, its size and room for what went
-wrong.  Sources are rewritten before they are compiled: each ``array[index]``, ``vload4(index,
-array)`` and ``vstore4(value, index, array)`` of an array in device memory asks the header first.
-An index that is too large is noted in the header, and item 0 is taken instead.  Gathers do the same
-(``lanes.h``).  What is not known to begin a buffer has no header and is not checked.
+wrong.  Sources are rewritten before they are compiled: each ``array[index]``, ``array + index``,
+``vload4(index, array)`` and ``vstore4(value, index, array)`` of an array in device memory asks the
+header first.  An index that is too large is noted in the header, and item 0 is taken instead.
+Gathers do the same (``lanes.h``).  What begins inside of a buffer has no header: where it begins is
+checked, but not how far one goes from there.
 """
 
 from __future__ import annotations
@@ -49,6 +50,7 @@ static inline ulong index_checked(
 
 _SEAM = re.compile(r'#line \d+ "(.+)"')
 _PARAMETER = re.compile(r"(?:__)?global\s+(?:\w+\s+)*?(\w+)\s*\*\s*(?:restrict\s+)?(\w+)\s*[,)]")
+_CAST = r"\((?:__)?global\s[^()]*\*\)"
 _LOCAL = re.compile(r"(?:__)?global\s+(?:const\s+|volatile\s+)*\w+\s*\*\s*(\w+)\s*=")
 
 
@@ -126,7 +128,10 @@ def _checked_function(text: str) -> str:
         return text
     return text[:body] + _checked_text(
         text[body:],
-        re.compile(rf"//[^\n]*|\bv(load|store)(\d+)\(|(?<![\w.>])({'|'.join(sorted(names))})\["),
+        re.compile(
+            rf"//[^\n]*|\bv(load|store)(\d+)\(|(?<![\w.>])({'|'.join(sorted(names))})\["
+            rf"|((?:{_CAST})?)(?<![\w.>])({'|'.join(sorted(names))}) \+ "
+        ),
         names,
     )
 
@@ -138,6 +143,12 @@ def _checked_text(text: str, access: re.Pattern[str], names: set[str]) -> str:
         done = match.end()
         if match[0].startswith("//"):
             parts.append(match[0])
+            continue
+        if match[5]:
+            array, end = f"{match[4]}{match[5]}", _operand_end(text, done)
+            index = _checked_text(text[done:end], access, names)
+            parts.append(f"{match[0]}AT({array}, {index})")
+            done = end
             continue
         close = _closing(text, done - 1)
         inner = text[done:close]
@@ -162,6 +173,16 @@ def _closing(text: str, begin: int) -> int:
         if depth == 0:
             return place
     raise ValueError(f"a bracket is not closed: {text[begin : begin + 40]!r}")
+
+
+def _operand_end(text: str, begin: int) -> int:
+    """Return where what is added to a pointer ends: at what closes, or parts, what is around it."""
+    depth = 0
+    for place in range(begin, len(text)):
+        if depth == 0 and text[place] in ",;)]}":
+            return place
+        depth += (text[place] in "([{") - (text[place] in ")]}")
+    return len(text)
 
 
 def _arguments(text: str) -> list[str]:

@@ -42,3 +42,20 @@ kernel void gather_records(__global const uint *at, __global const FilmSum *sour
     if (get_global_id(0) == 0)
         target[0] = least_lane(GATHER(source, (UInt)(at[0]), sum[1]));
 }
+
+kernel void begin_inside(__global const uint *at, __global const float *source, __global float *target)
+{
+    if (get_global_id(0) == 0)
+        target[0] = *(source + at[0]);
+}
+
+static inline __global const float4 *group_at(__global const float *source, uint index)
+{
+    return (__global const float4 *)source + index;
+}
+
+kernel void begin_group_inside(__global const uint *at, __global const float *source, __global float *target)
+{
+    if (get_global_id(0) == 0)
+        target[0] = group_at(source, at[0])->x;
+}
