@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import random
+import resource
 import signal
 import struct
 import subprocess
@@ -189,6 +190,26 @@ def test_a_full_disk_leaves_the_last_good_file_and_nothing_else(tmp_path):
 
     with pytest.raises(InputError, match="state: cannot write: No space left on device"):
         write_parts(path, parts())
+    assert path.read_bytes() == whole and os.listdir(tmp_path) == ["state"]
+
+
+def test_a_file_beyond_what_the_system_allows_leaves_the_last_good_one(tmp_path):
+    """A real limit, in a process of its own: what is refused comes after the first parts."""
+    path = tmp_path / "state"
+    whole = example(path)
+    command = (
+        "import sys; from psf_cl.errors import InputError; from psf_cl.files import write_parts\n"
+        "try: write_parts(sys.argv[1], [bytes(4096)] * 100)\n"
+        "except InputError as error: print(error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", command, path],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, 1 << 16)),
+    )
+    assert done.stdout == f"{path}: cannot write: File too large\n", done.stderr
     assert path.read_bytes() == whole and os.listdir(tmp_path) == ["state"]
 
 

@@ -19,7 +19,7 @@ from psf_cl.scene.animation import world_transforms
 from psf_cl.scene.curve import Curve
 from psf_cl.scene.far import far_from_origin, moved
 from psf_cl.scene.model import Material, Node, Skin, View
-from psf_cl.settings import PRESETS, resolve
+from psf_cl.settings import PRESETS, Settings, resolve
 
 ROOT = Path(__file__).resolve().parents[1]
 VIEW = camera((0.0, 0.0, 0.95), (0.0, -0.2, -1.0), 60.0)
@@ -177,6 +177,17 @@ def test_a_table_without_a_case_or_a_column_is_not_whole(tool):
     assert tool.missing_rows([whole], [("room", "pt"), ("glass", "pt")]) == ["glass with pt"]
     del whole["counters"]
     assert tool.missing_rows([whole], [("room", "pt")]) == ["counters"]
+
+
+def test_the_largest_pixel_is_that_of_all_samples_also_where_they_come_in_parts(tool, monkeypatch):
+    def part_of(device, scene, settings, spp, *others):
+        pixels = np.zeros((1, tool.SEEDS))
+        pixels[0, settings.seed] = 16.0
+        return tool.Picture(0, 0, 2.0, 0.0, 16.0, 8, 1.0, {}, pixels)
+
+    monkeypatch.setattr(tool, "part_of", part_of)
+    settings = Settings(integrator="metropolis")
+    assert tool.picture(None, None, settings, 64).largest == 16.0 / tool.SEEDS
 
 
 def test_the_table_tells_good_from_bad(tool, device, monkeypatch, tmp_path, capsys):

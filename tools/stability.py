@@ -88,6 +88,7 @@ class Picture:
     Attributes:
         error: standard error of the mean.
         seconds: processor time of rendering, of all threads.
+        pixels: luminance of the pixels, 0 where they are not finite: ``(height, width)``.
     """
 
     bad: int
@@ -98,6 +99,7 @@ class Picture:
     samples: int
     seconds: float
     counters: Mapping[str, Any]
+    pixels: np.ndarray
 
     @property
     def ns(self) -> float:
@@ -147,7 +149,8 @@ def picture(
         rejected=sum(part.rejected for part in parts),
         mean=float(np.mean(means)),
         error=float(np.std(means, ddof=1)) / math.sqrt(SEEDS),
-        largest=max(part.largest for part in parts),
+        # That of the picture of all samples, as without parts.
+        largest=float(np.mean([part.pixels for part in parts], axis=0).max()),
         samples=sum(part.samples for part in parts),
         seconds=sum(part.seconds for part in parts),
     )
@@ -179,6 +182,7 @@ def summed_up(image: Image, seconds: float) -> Picture:
     rgb = image.rgb.astype(np.float64)
     luminance = rgb @ LUMINANCE
     finite = np.isfinite(rgb).all(axis=-1)
+    pixels = np.where(finite, luminance, 0.0)
     variance = (
         float(np.mean(image.aovs["variance"].astype(float))) if "variance" in image.aovs else 0.0
     )
@@ -191,10 +195,11 @@ def summed_up(image: Image, seconds: float) -> Picture:
         rejected=stats["counters"]["rejected_samples"],
         mean=float(luminance[finite].mean()) if finite.any() else math.nan,
         error=math.sqrt(variance / luminance.size),
-        largest=float(np.where(finite, luminance, 0.0).max()),
+        largest=float(pixels.max()),
         samples=stats["spp"] * luminance.size,
         seconds=seconds,
         counters={k: v for k, v in counters.items() if v},
+        pixels=pixels,
     )
 
 
