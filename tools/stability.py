@@ -350,6 +350,10 @@ def changed(values: Mapping[str, Any]) -> str:
     return " ".join(f"{k}={v}" for k, v in values.items() if v != getattr(default, k))
 
 
+#: Ends of ranges that would only take hours: a row of the table has so many photons too.
+ENOUGH = {"photons": 10_000_000}
+
+
 def setting_values() -> dict[str, list[Any]]:
     """Return values of every setting, the default first: choices, and the ends of ranges."""
     values: dict[str, list[Any]] = {}
@@ -357,6 +361,8 @@ def setting_values() -> dict[str, list[Any]]:
         others: Sequence[Any] = item.metadata.get("choices") or item.metadata.get("range") or ()
         if item.metadata.get("switch"):
             others = (False, True)
+        if item.name in ENOUGH:
+            others = [min(value, ENOUGH[item.name]) for value in others]
         values[item.name] = list(dict.fromkeys([item.default, *others]))
     return values
 
