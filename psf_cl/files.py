@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import glob
 import hashlib
@@ -29,6 +30,16 @@ def read_file(path: Path) -> bytes:
     except (ValueError, MemoryError) as error:  # a name that no file can have; a file beyond memory
         raise InputError(f"{str(path)!r}: cannot be read: {error}") from None
     raise InputError(f"{path}: expected a file, got {found}")
+
+
+def decoded_text(data: bytes) -> str:
+    """Return text in UTF-8 or UTF-16 as its first bytes say, else UTF-8, else Latin-1."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16", "replace")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:

@@ -371,3 +371,97 @@ def test_every_shared_mesh_loads_or_is_refused():
             assert "\n" not in str(error)
             continue
         assert any(len(shape.mesh.triangles) for shape in scene.shapes)
+
+
+def _area_of(mesh: Mesh) -> np.ndarray:
+    """Return the sum of all triangles' vector areas, and the sum of their lengths."""
+    p = mesh.positions[mesh.triangles].astype(float)
+    cross = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]) / 2
+    return np.append(cross.sum(axis=0), np.linalg.norm(cross, axis=1).sum())
+
+
+#: An arrow's head, a comb and a frame whose hole hangs on a bridge, with their areas.
+CONCAVE = {
+    "arrow": ([(2, 1), (0, 3), (-2, 1), (0, 2)], 2.0),
+    "comb": ([(0, 0), (5, 0), (5, 4), (4, 4), (4, 1), (3, 1), (3, 4), (0, 4)], 17.0),
+    "frame": (
+        [(1, 1), (1, 3), (3, 3), (3, 1), (1, 1), (0, 0), (4, 0), (4, 4), (0, 4), (0, 0)],
+        12.0,
+    ),
+}
+
+
+@pytest.mark.parametrize("start", range(8))
+@pytest.mark.parametrize("shape", CONCAVE)
+@pytest.mark.parametrize("plane", ["z = 1", "x = 1", "y = 1", "backwards"])
+def test_concave_polygons_are_covered_once(tmp_path, shape, start, plane):
+    outline, area = CONCAVE[shape]
+    outline = [*outline[start % len(outline) :], *outline[: start % len(outline)]]
+    turned = {"z = 1": (0, 1, 2), "x = 1": (2, 0, 1), "y = 1": (1, 2, 0), "backwards": (1, 0, 2)}
+    points = np.array([(x, y, 1) for x, y in outline])[:, turned[plane]]
+    text = "".join("v {} {} {}\n".format(*point) for point in points)
+    text += "f " + " ".join(map(str, range(1, len(points) + 1))) + "\nf 1 2 3\n"
+    mesh = obj(tmp_path, text).shapes[0].mesh
+    vector = np.cross(points - points[0], np.roll(points, -1, axis=0) - points[0]).sum(axis=0) / 2
+    whole = Mesh("", mesh.positions, mesh.triangles[: len(points) - 2])
+    # Triangles that overlap or turn over have a larger sum of areas than the polygon.
+    assert _area_of(whole) == pytest.approx([*vector, area])
+    assert len(mesh.triangles) == len(points) - 1
+
+
+def test_a_concave_polygon_keeps_its_material_normals_and_coordinates(tmp_path):
+    points = "".join(f"v {x} {y} 0\nvt {x} {y}\n" for x, y in CONCAVE["comb"][0])
+    text = points + "vn 0 0 1\nusemtl a\nf 1 2 3\nusemtl b\nf "
+    scene = obj(
+        tmp_path, text + " ".join(f"{i}/{i}/1" for i in range(1, 9)) + "\nusemtl c\nf 1 2 4"
+    )
+    mesh = {shape.name: shape.mesh for shape in scene.shapes}["b"]
+    assert len(mesh.triangles) == 6
+    np.testing.assert_allclose(mesh.uvs[:, 0], mesh.positions[:, 0])
+    np.testing.assert_allclose(1 - mesh.uvs[:, 1], mesh.positions[:, 1])
+    np.testing.assert_allclose(mesh.normals, np.broadcast_to([0, 0, 1], mesh.normals.shape))
+
+
+def test_a_polygon_that_crosses_itself_comes_to_an_end(tmp_path):
+    star = [(np.cos(4 * np.pi * k / 5), np.sin(4 * np.pi * k / 5)) for k in range(5)]
+    text = "".join(f"v {x} {y} 0\n" for x, y in [*star, *star[::-1], *star])
+    mesh = obj(tmp_path, text + "f " + " ".join(map(str, range(1, 16)))).shapes[0].mesh
+    assert len(mesh.triangles) == 13
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_big_endian"])
+def test_ply_lines_may_end_as_on_old_macs(tmp_path, encoding):
+    text = ply_header(encoding, 3, 1) + ("0 0 0\n2 0 0\n0 3 0\n3 0 1 2\n" * (encoding == "ascii"))
+    data = text.replace("\n", "\r").encode()
+    if encoding != "ascii":
+        data += struct.pack(">9fB3i", 0, 0, 0, 2, 0, 0, 0, 3, 0, 3, 0, 1, 2)
+    (tmp_path / "a.ply").write_bytes(data)
+    mesh = load_mesh_scene(tmp_path / "a.ply").shapes[0].mesh
+    assert corners(mesh) == [[[0, 0, 0], [2, 0, 0], [0, 3, 0]]]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
+def test_obj_and_mtl_may_be_encoded_as_windows_does(tmp_path, encoding):
+    (tmp_path / "a.mtl").write_bytes("newmtl æ\nKd 1 0 0\n".encode(encoding))
+    text = f"mtllib a.mtl\n{TRIANGLE}usemtl æ\nf 1 2 3\n"
+    (tmp_path / "a.obj").write_bytes(text.encode(encoding))
+    scene = load_mesh_scene(tmp_path / "a.obj")
+    assert not scene.notes and scene.materials[0].base_color == (1, 0, 0)
+
+
+def test_vertices_that_are_no_number_are_not_finite(tmp_path):
+    mesh = obj(tmp_path, f"{TRIANGLE}v 1.#IND -1.#INF nan\nf 1 2 3\nf 1 2 4\n").shapes[0].mesh
+    assert np.isfinite(mesh.positions[mesh.triangles]).all(axis=(1, 2)).tolist() == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("name", "data"),
+    [
+        ("a.obj", (TRIANGLE + "p 1 2 3\n").encode()),
+        ("a.ply", (ply_header("ascii", 1, 0) + "0 0 0\n").encode()),
+    ],
+)
+def test_a_file_of_points_is_told_so(tmp_path, name, data):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(InputError, match=r"no triangles .*points"):
+        load_scene(tmp_path / name)

@@ -143,3 +143,24 @@ def test_colours_of_vertices_are_decoded(tmp_path):
     # 188 is half of the light.
     half = [0.5029] * 3
     np.testing.assert_allclose(mesh.colors[:, :3], [[1, 0, 0], half, [0, 0, 1]], atol=1e-3)
+
+
+def test_a_library_of_another_name_is_said_and_the_file_of_the_same_name_stands_in(tmp_path):
+    (tmp_path / "a.mtl").write_text("newmtl m\nKd 1 0 0\n")
+    triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n"
+    (tmp_path / "a.obj").write_text("mtllib old.mtl older.mtl\n" + triangle)
+    scene = load_mesh_scene(tmp_path / "a.obj")
+    assert scene.materials[0].base_color == (1, 0, 0)
+    (note,) = scene.notes
+    assert "old.mtl: expected a file" in note and note.endswith("a.mtl is read instead")
+
+
+def test_spaces_in_names_of_libraries_may_have_a_backslash(tmp_path):
+    (tmp_path / "my own.mtl").write_text("newmtl m\nKd 1 0 0\n")
+    (tmp_path / "other.mtl").write_text("newmtl n\nKd 0 1 0\n")
+    triangle = "v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\nusemtl n\nf 2 3 1\n"
+    (tmp_path / "a.obj").write_text("mtllib other.mtl my\\ own.mtl\n" + triangle)
+    scene = load_mesh_scene(tmp_path / "a.obj")
+    assert not scene.notes
+    colors = {material.name: material.base_color for material in scene.materials}
+    assert colors == {"m": (1, 0, 0), "n": (0, 1, 0)}

@@ -72,7 +72,8 @@ def load_scene(
     scene = load_toml(path, load_mesh_file) if is_toml else load_mesh_file(path)
     count = sum(len(shape.mesh.triangles) for shape in scene.shapes)
     if count == 0:
-        raise InputError(f"{path} has no triangles")
+        why = f" ({'; '.join(scene.notes)})" if scene.notes else ""
+        raise InputError(f"{path} has no triangles{why}")
     if count > MAX_TRIANGLES:
         raise InputError(f"{path}: expected at most {MAX_TRIANGLES} triangles; got {count}")
     if environment == NO_ENVIRONMENT:

@@ -1,8 +1,8 @@
 """OBJ, PLY and STL files: trimesh reads them, this module checks what it returns.
 
 The format readers of trimesh are called directly: its mesh class would merge and reorder.  It also
-drops most of what an MTL file says, so ``mtl`` reads it; OBJ text
-is put into the plain form that trimesh's reader expects first.
+drops most of what an MTL file says, so ``mtl`` reads it; ``obj_text`` puts OBJ text into the plain
+form that trimesh's reader expects first.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from psf_cl.errors import InputError
-from psf_cl.files import read_file
+from psf_cl.files import decoded_text, read_file
 from psf_cl.scene.model import Material, Mesh, Scene, Shape
-from psf_cl.scene.mtl import MaterialLibrary, Picture
-from psf_cl.scene.polygons_ply import load_polygons
+from psf_cl.scene.mtl import MaterialLibrary, Picture, listed
+from psf_cl.scene.obj_text import plain_obj, with_concave_cut
+from psf_cl.scene.polygons_ply import load_polygons, plain_ply
 from psf_cl.scene.texture import decoded_srgb
 
 SUFFIXES = (".obj", ".ply", ".stl")
@@ -55,7 +56,8 @@ def load_mesh_scene(path: Path) -> Scene:
     """Return the shapes of an OBJ, PLY or STL file, one a material, with OBJ's materials.
 
     Normals and texture coordinates are kept where the file has them; vertices that are not finite
-    are kept too.  Polygons become fans of triangles.  Missing material files and textures are
+    are kept too.  Polygons become triangles, fans in PLY
+    files even where they are concave.  Missing material files and textures are
     noted.
 
     Raises:
@@ -69,6 +71,8 @@ def load_mesh_scene(path: Path) -> Scene:
 
 def _load_ply(path: Path, data: bytes) -> Scene:
     from trimesh.exchange.ply import load_ply
+
+    data = plain_ply(data)
 
     def read_ply() -> dict[str, Any]:
         try:
@@ -87,12 +91,16 @@ def _load_ply(path: Path, data: bytes) -> Scene:
     if named is not None:
         name = named[1].decode("utf-8", "replace")
         material = Material(base_color_texture=library.texture(Picture(name, {})))
+    shapes = _shapes(path, [read])
+    notes = [f"left out: {reason}" for reason in library.lost]
+    if not shapes and np.ndim(read.get("vertices")) == 2:
+        notes.append("points are left out")
     return Scene(
         path=str(path),
-        shapes=_shapes(path, [read]),
+        shapes=shapes,
         materials=(material,),
         textures=tuple(library.textures),
-        notes=tuple(f"left out: {reason}" for reason in library.lost),
+        notes=tuple(notes),
         files=(str(path), *library.files),
     )
 
@@ -104,7 +112,7 @@ def _load_stl(path: Path, data: bytes) -> Scene:
     if len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):
         read = _guarded(path, "STL", lambda: load_stl_binary(io.BytesIO(data)))
     elif data.lstrip()[:5].lower() == b"solid":
-        read = _guarded(path, "STL", lambda: load_stl_ascii(io.StringIO(_decoded(data))))
+        read = _guarded(path, "STL", lambda: load_stl_ascii(io.StringIO(decoded_text(data))))
     else:
         raise InputError(f"{path}: neither ASCII STL nor binary STL of the length in its header")
     # A file with several solids has a table of meshes, any other is the mesh itself.
@@ -115,13 +123,6 @@ def _load_stl(path: Path, data: bytes) -> Scene:
 def _shapes(path: Path, parts: Iterable[dict[str, Any]]) -> tuple[Shape, ...]:
     meshes = [_checked_mesh(path, path.stem, part) for part in parts]
     return tuple(Shape(mesh.name, mesh, np.eye(4), 0) for mesh in meshes if mesh is not None)
-
-
-def _decoded(data: bytes) -> str:
-    try:
-        return data.decode("utf-8")
-    except UnicodeDecodeError:
-        return data.decode("latin-1")
 
 
 def _guarded(path: Path, name: str, read: Callable[[], Found]) -> Found:
@@ -222,7 +223,7 @@ class _MaterialNames:
 def _load_obj(path: Path, data: bytes) -> Scene:
     from trimesh.exchange.obj import load_obj
 
-    text = _plain_obj(path, _decoded(data))
+    text = with_concave_cut(plain_obj(path, decoded_text(data)))
     libraries = re.findall(r"^mtllib (.+)$", text, re.MULTILINE)
     text = "mtllib names\n" + text
     resolver: Any = _MaterialNames(text)
@@ -247,7 +248,7 @@ def _load_obj(path: Path, data: bytes) -> Scene:
         materials.setdefault(name, known.get(name, Material(name=name)))
         shapes.append(Shape(name, mesh, np.eye(4), list(materials).index(name)))
     if unknown:
-        notes.append(f"{path}: undefined materials stay grey: {_listed(unknown)}")
+        notes.append(f"{path}: undefined materials stay grey: {listed(unknown)}")
     return Scene(
         path=str(path),
         shapes=tuple(shapes),
@@ -261,74 +262,13 @@ def _load_obj(path: Path, data: bytes) -> Scene:
 def _read_libraries(path: Path, libraries: list[str]) -> MaterialLibrary:
     """Return the materials of all ``mtllib`` lines."""
     library = MaterialLibrary(path)
+    names: list[str] = []
     for line in libraries:
         # A line names one file with spaces in its name, or several files.
-        for name in [line] if os.path.isfile(path.parent / line) else line.split():
-            library.read(name)
+        whole = os.path.isfile(path.parent / line)
+        names += [line] if whole else re.split(r"(?<!\\) ", line)
+    # Some programs put a backslash before each space of a name.
+    library.read(name.replace("\\ ", " ") for name in dict.fromkeys(names))
     if library.lost:
-        library.notes.append(f"{path}: textures are left out: {_listed(library.lost)}")
+        library.notes.append(f"{path}: textures are left out: {listed(library.lost)}")
     return library
-
-
-def _listed(items: list[str]) -> str:
-    """Return the first items in one line, and how many more there are."""
-    more = f" and {len(items) - 3} more" if len(items) > 3 else ""
-    return ", ".join(items[:3]) + more
-
-
-def _plain_obj(path: Path, text: str) -> str:
-    """Return OBJ text in the one form that trimesh reads without mistakes.
-
-    No comments, continuations, tabs and indents.  No negative indices: trimesh counts them from the
-    end of the file, not from the line that they stand on.  Every corner of the form of the first
-    one: where some corners lack a texture coordinate or a normal, they get (0, 0) and a normal of
-    no length, which ``_unit_normals`` refuses.
-    """
-    text = re.sub(r"\r\n?", "\n", text).replace("\\\n", " ")
-    text = re.sub(r"[ \t]+", " ", text)
-    text = re.sub(r"^ ?#.*| #.*$|^ | $", "", text, flags=re.MULTILINE)
-    if re.search(r"^f (?:.*[ /])?0(?:[ /]|$)", text, re.MULTILINE):
-        raise InputError(f"{path}: a face has the index 0; OBJ counts from 1")
-    first_corners = re.findall(r"^f -?\d+(?:/(-?\d*))?(?:/(-?\d+))?", text, re.MULTILINE)
-    forms = {(bool(uv), bool(normal)) for uv, normal in first_corners}
-    if len(forms) < 2 and not re.search(r"^f .*-", text, re.MULTILINE):
-        return text
-
-    lines = text.split("\n")
-    total = {word: sum(line.startswith(word + " ") for line in lines) for word in ("v", "vt", "vn")}
-    missing = ["", "", ""]
-    if len(forms) > 1:
-        missing = ["", str(total["vt"] + 1), str(total["vn"] + 1)]
-        lines += ["vt 0 0", "vn 0 0 0"]
-    seen = dict.fromkeys(total, 0)
-    for row, line in enumerate(lines):
-        keyword, _, corners = line.partition(" ")
-        if keyword in seen:
-            seen[keyword] += 1
-        elif keyword == "f":
-            plain = [_absolute_corner(corner, list(seen.values())) for corner in corners.split()]
-            if any(corner is None for corner in plain):
-                raise InputError(f"{path}: an index of {line[:60]!r} is out of range")
-            lines[row] = "f " + " ".join(_joined(corner, missing) for corner in plain if corner)
-    return "\n".join(lines)
-
-
-def _joined(corner: list[str], missing: list[str]) -> str:
-    parts = [index or other for index, other in zip(corner, missing, strict=True)]
-    return "/".join(parts).rstrip("/")
-
-
-def _absolute_corner(corner: str, seen: list[int]) -> list[str] | None:
-    """Return vertex, uv and normal index of ``v/vt/vn``, absent ones as ""; None if out of range.
-
-    A negative index counts back from the last of the ``seen`` entries.
-    """
-    parts = ["", "", ""]
-    for place, index in enumerate(corner.split("/")[:3]):
-        if re.fullmatch(r"-\d{1,18}", index):
-            absolute = seen[place] + 1 + int(index)
-            if absolute < 1:
-                return None
-            index = str(absolute)
-        parts[place] = index
-    return parts

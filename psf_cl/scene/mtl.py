@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from psf_cl.errors import InputError
-from psf_cl.files import read_file
+from psf_cl.files import decoded_text, read_file
 from psf_cl.scene.model import MAX_RADIANCE, Material, Texture, limited
 from psf_cl.scene.texture import load_texture
 
@@ -80,21 +80,34 @@ class MaterialLibrary:
     _pictures: dict[str, np.ndarray | None] = field(default_factory=dict)
     _uses: dict[tuple[object, ...], int] = field(default_factory=dict)
 
-    def read(self, name: str) -> None:
-        """Add the materials of a file; that it is missing is noted.
+    def read(self, names: Iterable[str]) -> None:
+        """Add the materials of some files; those that cannot be read are noted.
+
+        If none can, the file of the OBJ's own name stands in: both get new names together.
 
         Raises:
             InputError: a colour is not finite.
         """
+        lost = [reason for name in names if (reason := self._read(name))]
+        if not lost:
+            return
+        note = f"materials are left out: {listed(lost)}"
+        own = self.path.with_suffix(".mtl").name
+        if not self.files and not self._read(own):
+            note += f"; {own} is read instead"
+        self.notes.append(note)
+
+    def _read(self, name: str) -> str:
+        """Add the materials of a file; return why it cannot be read, "" if it can."""
         try:
             place = self._place(name)
-            text = read_file(place).decode("utf-8", "replace")
+            text = decoded_text(read_file(place))
         except InputError as error:
-            self.notes.append(f"materials are left out: {error}")
-            return
+            return str(error)
         self.files.append(str(place))
         for material_name, statements in _blocks(text):
             self.materials[material_name] = self._material(material_name, statements)
+        return ""
 
     def texture(self, picture: Picture, srgb: bool = True) -> int:
         """Return the index of the texture of a picture, -1 if it cannot be read."""
@@ -255,6 +268,12 @@ class MaterialLibrary:
             pixels = self._pictures[key]
         index = self._add(picture, pixels, False)
         return replace(material, normal_texture=index, normal_scale=strength)
+
+
+def listed(items: list[str]) -> str:
+    """Return the first items in one line, and how many more there are."""
+    more = f" and {len(items) - 3} more" if len(items) > 3 else ""
+    return ", ".join(items[:3]) + more
 
 
 def _blocks(text: str) -> Iterator[tuple[str, dict[str, str]]]:

@@ -1,4 +1,4 @@
-"""Binary PLY files whose faces differ in their numbers of corners, which trimesh does not read.
+"""PLY files that trimesh does not read: faces of several sizes in binary ones, ends of lines.
 
 Source: Turk, "The PLY Polygon File Format", 1994.
 """
@@ -23,6 +23,19 @@ _TYPES = {
 _HEADER = re.compile(
     rb"ply\r?\nformat binary_(little|big)_endian 1.0.*?\nend_header\r?\n", re.DOTALL
 )
+
+
+def plain_ply(data: bytes) -> bytes:
+    """Return a PLY file whose header's lines end in LF, as only that is read.
+
+    Programs from the Mac end them, and in ASCII files all lines, with CR alone.
+    """
+    if re.match(rb"ply\r[^\n]", data) is None:
+        return data
+    header, end, body = data.partition(b"end_header\r")
+    if b"format ascii" in header:
+        body = body.replace(b"\r", b"\n")
+    return (header + end).replace(b"\r", b"\n") + body
 
 
 def load_polygons(data: bytes) -> dict[str, Any] | None:
