@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from bsdf_truth import albedo_tables
 from scipy.stats import qmc
 from test_bsdf import direction
 from test_bsdf_layers import record, sample
@@ -120,3 +121,13 @@ def test_no_combination_gains_or_loses_energy(device, count):
         cosines[under.argmax()],
         returned[under.argmax()],
     )
+
+
+def test_with_few_constants_tables_fit_into_what_any_device_has():
+    """Without that of glass that does not reflect, which is left out beside layers then."""
+    arrays = {k: v for k, v in albedo_tables().items() if isinstance(v, np.ndarray)}
+    assert {"GLASS_TABLE", "STRETCHED_TABLE"} < arrays.keys()
+    del arrays["BARE_GLASS_TABLE"]
+    # OpenCL 1.2, table 4.3: CL_DEVICE_MAX_CONSTANT_BUFFER_SIZE is 64 KiB or more.
+    words = {True: 2, False: 4}
+    assert sum(v.size * words[k.endswith("_TABLE")] for k, v in arrays.items()) < 64 << 10

@@ -498,8 +498,8 @@ def header() -> str:
         lines += text_of_fit(fit)
     lines += ["#endif", "", "#if TRANSMISSION", f"#define GLASS_LARGEST {LARGEST:.9g}f"]
     lines += [shape_of("GLASS", GLASS_SHAPE)]
-    for made in tables_of_glass():
-        lines += text_of_table(made)
+    glass, bare = tables_of_glass()
+    lines += [*text_of_table(glass), "", "#if BARE_GLASS", *text_of_table(bare), "#endif"]
     lines += ["#endif", "", "#if LAYERS", f"#define SHEEN_SCALE {SHEEN_SCALE:.1f}f"]
     lines += [f"#define SHEEN_ROUGHNESS_MIN {SHEEN_ROUGHNESS_MIN:.1f}f"]
     lines += [f"#define SHEEN_TERMS {sheen.coefficients.shape[0]}"]

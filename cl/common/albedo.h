@@ -3,6 +3,13 @@
 #pragma once
 
 #include "lanes.h"
+
+// Devices need to have room for no more than 64 KiB of constants: some have none for the second table of glass beside
+// those of stretched highlights.
+#ifndef FEW_CONSTANTS
+#define FEW_CONSTANTS 0
+#endif
+#define BARE_GLASS (!FEW_CONSTANTS || !LAYERS)
 #include "albedo_tables.h"
 
 #if GLOSSY
@@ -151,10 +158,15 @@ static inline Float glass_albedo(Mask wanted, Float alpha, Float eta, Float spec
     const Float places[3] = {sqrt(cosine * (1.0f + alpha) / (cosine + alpha)), sqrt(alpha), 0.5f + pick(x < 0.0f, -t, t)};
     Float kept = look_up(wanted, GLASS_TABLE, GLASS_SHAPE, 3, places);
     const Mask dull = wanted & (specular < 1.0f);
+#if BARE_GLASS
     if (any_lane(dull)) {
         const Float bare = look_up(dull, BARE_GLASS_TABLE, GLASS_SHAPE, 3, places);
         kept = pick(dull, bare + (kept - bare) * specular, kept);
     }
+#else
+    // Nothing is given back.
+    kept = pick(dull, (Float)(1.0f), kept);
+#endif
     return max(kept, 0.05f);
 }
 #endif
