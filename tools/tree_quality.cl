@@ -1,5 +1,5 @@
 // Rays through a tree, timed or counted.  COUNTED: the traversal's box and triangle tests each add 1
-// to a word, through the parameter that cut-outs would have.
+// to a word of their ray's, through the parameter that cut-outs would have; no rays share their way.
 
 #define FEW 0
 #include "../cl/common/geometry.h"
@@ -8,6 +8,8 @@
 #if COUNTED
 #define ALPHA_PARAMETERS , uint *visits
 #define ALPHA_ARGUMENTS , visits
+#define ALPHA_ARGUMENTS_OF(lane) , visits + 2u * (lane)
+#define LANES_APART W
 #define intersect_boxes(...) (++visits[0], intersect_boxes(__VA_ARGS__))
 #define intersect_block(...) (++visits[1], intersect_block(__VA_ARGS__))
 #endif
@@ -48,15 +50,18 @@ kernel void trace_closest_rays(
         return;
     RaySetups setups;
     load_rays(&setups, rays, first, ray_count);
+    uint visits[2 * W] = {0};
+    const Hits hits = trace_closest(nodes, blocks, &setups ALPHA_ARGUMENTS);
+    uint lane_triangle[W];
+    float lane_t[W];
+    store_lanes_u(hits.triangle, lane_triangle);
+    store_lanes(hits.t, lane_t);
     for (uint k = 0; k < W && first + k < ray_count; ++k) {
-        const RaySetup ray = ray_setup(&setups, k);
-        uint visits[2] = {0, 0};
-        const Hit hit = trace_closest(nodes, blocks, &ray ALPHA_ARGUMENTS);
         const size_t i = first + k;
-        triangles[i] = hit.triangle;
-        distances[i] = hit.t;
-        counts[2 * i] = visits[0];
-        counts[2 * i + 1] = visits[1];
+        triangles[i] = lane_triangle[k];
+        distances[i] = lane_t[k];
+        counts[2 * i] = visits[2 * k];
+        counts[2 * i + 1] = visits[2 * k + 1];
     }
 }
 
@@ -75,12 +80,12 @@ kernel void trace_any_rays(
         return;
     RaySetups setups;
     load_rays(&setups, rays, first, ray_count);
+    uint visits[2 * W] = {0};
+    const uint blocked = lane_bits(trace_any(nodes, blocks, &setups ALPHA_ARGUMENTS));
     for (uint k = 0; k < W && first + k < ray_count; ++k) {
-        const RaySetup ray = ray_setup(&setups, k);
-        uint visits[2] = {0, 0};
         const size_t i = first + k;
-        triangles[i] = trace_any(nodes, blocks, &ray ALPHA_ARGUMENTS) ? 0 : NO_HIT;
-        counts[2 * i] = visits[0];
-        counts[2 * i + 1] = visits[1];
+        triangles[i] = blocked >> k & 1u ? 0 : NO_HIT;
+        counts[2 * i] = visits[2 * k];
+        counts[2 * i + 1] = visits[2 * k + 1];
     }
 }
