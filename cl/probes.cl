@@ -65,8 +65,11 @@ LARGE_FUNCTION Float reflected_light(
     SCENE_PARAMETERS RAY_PARAMETERS, Mask mask, SurfacePoint s, LightChoice choice, UInt seed)
 {
     const Vec3 above = add_scaled(s.p, s.ng, s.offset);
+    Float u1;
+    Float u2;
+    sample_pair(seed, (UInt)(0u), (UInt)(PAIR_LIGHT), params->sampler, &u1, &u2);
     const LightSample light = sample_light(params, lights, surfaces, materials TEXTURE_ARGUMENTS COLOR_ARGUMENTS,
-                                           SKY_ARGUMENTS mask, above, seed, (UInt)(0u), (UInt)(0u), choice);
+                                           SKY_ARGUMENTS mask, above, u1, u2, seed, (UInt)(0u), (UInt)(0u), choice);
     const Float cosine = dot3(s.ns, light.wi);
     const Mask lit = mask & (light.pdf > 0.0f) & (cosine > 0.0f) & (dot3(s.ng, light.wi) > 0.0f);
     if (!any_lane(lit))

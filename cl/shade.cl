@@ -609,10 +609,8 @@ kernel void shade_paths(
 #endif
     const UInt pair = PAIR_VERTEX + depth * VERTEX_PAIRS;
     const UInt index = reversed_index(params, sample, depth + 1u);
-    UInt lobe_bits;
-    UInt light_bits;
-    sample_bits(seed, index, pair + PAIR_CHOICE, params->sampler, &lobe_bits, &light_bits);
-    const Float u_lobe = unit_float(lobe_bits);
+    const VertexBits numbers = vertex_bits(seed, index, pair, params->sampler);
+    const Float u_lobe = unit_float(numbers.choice.first);
 
 #if CONNECT
     if (params->light_count > 0u) {
@@ -652,13 +650,17 @@ kernel void shade_paths(
             const Mask sends = asks & (rays > ray);
             if (!any_lane(sends))
                 continue;
-            const UInt ray_bits = light_bits + part * ray;
+            const UInt ray_bits = numbers.choice.second + part * ray;
             const UInt ray_pair =
                 ray == 0u ? pair : PAIR_RAYS + (depth * SHADOW_RAYS + ray) * VERTEX_PAIRS;
+            BitPair place = numbers.light;
+            if (ray > 0u)
+                sample_bits(seed, index, ray_pair + PAIR_LIGHT, params->sampler, &place.first, &place.second);
 #else
             const Mask sends = asks;
-            const UInt ray_bits = light_bits;
+            const UInt ray_bits = numbers.choice.second;
             const UInt ray_pair = pair;
+            const BitPair place = numbers.light;
 #endif
             const LightChoice choice = choose_light(params, lights CHOICE_ARGUMENTS, sends, query, ray_bits);
 #if AOV_LIGHTS
@@ -675,7 +677,8 @@ kernel void shade_paths(
 #if ENVIRONMENT == 2
                                                    environment,
 #endif
-                                                   sends, above, seed, index, ray_pair, choice);
+                                                   sends, above, unit_float(place.first), unit_float(place.second),
+                                                   seed, index, ray_pair, choice);
             const Vec3 wi_local = vec3(dot3(tangent, light.wi), dot3(bitangent, light.wi), dot3(s.ns, light.wi));
             Float pdf;
             const Vec3 f = eval_bsdf(b, chances, wo_local, wi_local, dot3(s.ng, light.wi), &pdf);
@@ -738,9 +741,8 @@ kernel void shade_paths(
     }
 #endif
 
-    Float u1;
-    Float u2;
-    sample_pair(seed, index, pair + PAIR_BSDF, params->sampler, &u1, &u2);
+    const Float u1 = unit_float(numbers.bsdf.first);
+    const Float u2 = unit_float(numbers.bsdf.second);
 #if GUIDE
     const Vec3 drawn = sample_guided(guide_cells, guide.known, b, chances, wo_local GUIDE_TURN, u_lobe, u1, u2);
 #else

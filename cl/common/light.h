@@ -386,8 +386,6 @@ static inline UInt rays_asked(__global const Params *params RAYS_PARAMETERS, Mas
 }
 #endif
 
-/// Draw a direction to the light that was chosen, for rays that start at `origin`.
-///
 /// Draw a point of a flat light, uniformly by area, as parts of its two edges; `flags` are the light's.
 static inline void sample_flat(Mask wanted, UInt flags, Float u1, Float u2, Float *part1, Float *part2)
 {
@@ -410,7 +408,10 @@ static inline void sample_flat(Mask wanted, UInt flags, Float u1, Float u2, Floa
 #endif
 }
 
-/// pdf is 0 where nothing arrives.  `seed`, `reversed_index` and `pair` (the vertex's first) name the numbers.
+/// Draw a direction to the light that was chosen, for rays that start at `origin`.
+///
+/// pdf is 0 where nothing arrives.  `u1` and `u2` are PAIR_LIGHT of the vertex whose first pair is `pair`;
+/// `seed` and `reversed_index` name what a textured sky takes beside them.
 LARGE_FUNCTION LightSample sample_light(
     __global const Params *params,
     __global const Light *lights,
@@ -421,15 +422,13 @@ LARGE_FUNCTION LightSample sample_light(
 #endif
     Mask active,
     Vec3 origin,
+    Float u1,
+    Float u2,
     Seed seed,
     UInt reversed_index,
     UInt pair,
     LightChoice choice)
 {
-    Float u1;
-    Float u2;
-    sample_pair(seed, reversed_index, pair + PAIR_LIGHT, params->sampler, &u1, &u2);
-
     const UInt light = choice.light;
     const Float pmf = choice.pmf;
     const UInt kind = GATHER_U(lights, light, kind);

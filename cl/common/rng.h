@@ -82,6 +82,22 @@ static inline void random_bits(UInt key, UInt index, UInt *first, UInt *second)
 /// What the numbers of a pair of dimensions depend on, beside the index of the sample.
 static inline UInt pair_key(UInt seed, UInt pair) { return mix_bits(seed + pair * 0x9e3779b9u); }
 
+/// The index of a sample in a pair's own order.
+static inline UInt shuffled_index(UInt reversed_index, UInt key)
+{
+    return reverse_bits(scramble_reversed(reversed_index, key));
+}
+
+// Seeds of their own for both digits' scrambles: rotations of a mixed number.
+static inline UInt first_sobol(UInt shuffled, UInt key)
+{
+    return reverse_bits(scramble_reversed(shuffled, rotate(key, (UInt)(11u)) ^ 0x68bc21ebu));
+}
+static inline UInt second_sobol(UInt shuffled, UInt key)
+{
+    return reverse_bits(scramble_reversed(sobol_reversed(shuffled), rotate(key, (UInt)(22u)) ^ 0x02e5be93u));
+}
+
 /// Two uniform 32-bit numbers, stratified over the samples of a pixel if the sampler is Sobol'.
 ///
 /// `reversed_index` is the sample's index with its bits reversed: once for all pairs of a vertex.
@@ -90,11 +106,9 @@ LARGE_FUNCTION void new_bits(
 {
     const UInt key = pair_key(seed, pair);
     if (sampler == SAMPLER_SOBOL) {
-        const UInt shuffled = reverse_bits(scramble_reversed(reversed_index, key));
-        // Seeds of their own for both digits' scrambles: rotations of a mixed number.
-        *first = reverse_bits(scramble_reversed(shuffled, rotate(key, (UInt)(11u)) ^ 0x68bc21ebu));
-        *second =
-            reverse_bits(scramble_reversed(sobol_reversed(shuffled), rotate(key, (UInt)(22u)) ^ 0x02e5be93u));
+        const UInt shuffled = shuffled_index(reversed_index, key);
+        *first = first_sobol(shuffled, key);
+        *second = second_sobol(shuffled, key);
     } else {
         random_bits(key, reversed_index, first, second);
     }
@@ -142,6 +156,57 @@ static inline void sample_bits(
     Seed seed, UInt reversed_index, UInt pair, uint sampler, UInt *first, UInt *second)
 {
     new_bits(seed, reversed_index, pair, sampler, first, second);
+}
+#endif
+
+/// Two uniform 32-bit numbers.
+typedef struct {
+    UInt first;
+    UInt second;
+} BitPair;
+
+/// The pairs that every vertex draws.
+typedef struct {
+    BitPair choice;
+    BitPair bsdf;
+    BitPair light;
+} VertexBits;
+
+/// What sample_bits gives for the pairs of a vertex, of which `pair` is the first.
+///
+/// Side by side: one number after the other, most of the time is spent waiting for products.
+#if METROPOLIS
+static inline VertexBits vertex_bits(Seed seed, UInt reversed_index, UInt pair, uint sampler)
+{
+    VertexBits b;
+    sample_bits(seed, reversed_index, pair + PAIR_CHOICE, sampler, &b.choice.first, &b.choice.second);
+    sample_bits(seed, reversed_index, pair + PAIR_BSDF, sampler, &b.bsdf.first, &b.bsdf.second);
+    sample_bits(seed, reversed_index, pair + PAIR_LIGHT, sampler, &b.light.first, &b.light.second);
+    return b;
+}
+#else
+LARGE_FUNCTION VertexBits vertex_bits(Seed seed, UInt reversed_index, UInt pair, uint sampler)
+{
+    const UInt choice = pair_key(seed, pair + PAIR_CHOICE);
+    const UInt bsdf = pair_key(seed, pair + PAIR_BSDF);
+    const UInt light = pair_key(seed, pair + PAIR_LIGHT);
+    VertexBits b;
+    if (sampler == SAMPLER_SOBOL) {
+        const UInt choice_index = shuffled_index(reversed_index, choice);
+        const UInt bsdf_index = shuffled_index(reversed_index, bsdf);
+        const UInt light_index = shuffled_index(reversed_index, light);
+        b.choice.first = first_sobol(choice_index, choice);
+        b.bsdf.first = first_sobol(bsdf_index, bsdf);
+        b.light.first = first_sobol(light_index, light);
+        b.choice.second = second_sobol(choice_index, choice);
+        b.bsdf.second = second_sobol(bsdf_index, bsdf);
+        b.light.second = second_sobol(light_index, light);
+    } else {
+        random_bits(choice, reversed_index, &b.choice.first, &b.choice.second);
+        random_bits(bsdf, reversed_index, &b.bsdf.first, &b.bsdf.second);
+        random_bits(light, reversed_index, &b.light.first, &b.light.second);
+    }
+    return b;
 }
 #endif
 
