@@ -12,6 +12,7 @@
 #include "common/cells.h"
 #include "common/cell_samples.h"
 #include "common/hash_map.h"
+#include "common/pixel_queue.h"
 #include "common/cell_history.h"
 #include "common/shared_samples.h"
 #include "common/walls.h"
@@ -29,21 +30,19 @@ kernel void count_crowds(
     const volatile __global uint *counters,
     volatile __global uint *crowds)
 {
-    const uint first = get_global_id(0) * (W * RUN);
-    const uint end = min(first + W * RUN, params->pixel_count);
-    const uint passes = first < end ? complete_passes(params, counters) : 0u;
+    const PixelQueue own = pixel_queue(params->pixel_count);
+    const uint passes = own.next < own.end ? complete_passes(params, counters) : 0u;
     for (uint k = 0; k < passes; ++k) {
         const PassPlace place = place_of(params, counters[COUNTER_FILM_PASS] + k);
-        for (uint i = first; i < end; i += W) {
-            const UInt wanted = lanes_before(MASK_ALL) + i;
-            const Mask inside = wanted < params->pixel_count;
-            const UInt pixel = pick_u(inside, wanted, (UInt)(0u));
-            const UInt vertex = GATHER_U(beyond + place.samples, pixel, vertex);
-            const Mask there = inside & (vertex != 0u);
+        PixelQueue queue = own;
+        PixelBlock block;
+        while (take_block(&queue, &block)) {
+            const UInt vertex = GATHER_U(beyond + place.samples, block.pixel, vertex);
+            const Mask there = block.inside & (vertex != 0u);
             if (!any_lane(there))
                 continue;
-            const CellQuery query = load_query(params, vertices + place.samples, pixel, vertex, place.width);
-            const UInt at = entry_of(params, first_place_to_store(params, &query, pixel, place.pass));
+            const CellQuery query = load_query(params, vertices + place.samples, block.pixel, vertex, place.width);
+            const UInt at = entry_of(params, first_place_to_store(params, &query, block.pixel, place.pass));
             uint lane_at[W];
             store_lanes_u(at, lane_at);
             for (uint left = lane_bits(there); left;) {
@@ -71,27 +70,26 @@ kernel void mark_near_cells(
     const volatile __global uint *counters,
     volatile __global uint *near_cells CROWD_BUFFERS)
 {
-    const uint first = get_global_id(0) * (W * RUN);
-    const uint end = min(first + W * RUN, params->pixel_count);
-    const uint passes = first < end ? complete_passes(params, counters) : 0u;
+    const PixelQueue own = pixel_queue(params->pixel_count);
+    const uint passes = own.next < own.end ? complete_passes(params, counters) : 0u;
     for (uint k = 0; k < passes; ++k) {
         const PassPlace place = place_of(params, counters[COUNTER_FILM_PASS] + k);
         volatile __global uint *marks = near_cells + place.slots;
-        for (uint i = first; i < end; i += W) {
-            const UInt wanted = lanes_before(MASK_ALL) + i;
-            const Mask inside = wanted < params->pixel_count;
-            const UInt pixel = pick_u(inside, wanted, (UInt)(0u));
-            const UInt vertex = GATHER_U(beyond + place.samples, pixel, vertex);
-            const Mask near = inside & ((vertex & VERTEX_NEAR) != 0u);
-            if (!any_lane(near))
+        PixelQueue queue = own;
+        PixelBlock block;
+        while (take_block(&queue, &block)) {
+            const UInt vertex = GATHER_U(beyond + place.samples, block.pixel, vertex);
+            const Mask near = block.inside & ((vertex & VERTEX_NEAR) != 0u);
+            const Mask ready = near & !put_off(&queue, &block, near);
+            if (!any_lane(ready))
                 continue;
-            const CellQuery query = load_query(params, vertices + place.samples, pixel, vertex, place.width);
+            const CellQuery query = load_query(params, vertices + place.samples, block.pixel, vertex, place.width);
             const CellPlace stored = place_to_store(
-                params, &query, pixel, place.pass CROWD_ARGUMENTS_OF(crowds + place.slots));
-            const CellPlace own = place_to_look_up(
-                params, &query, pixel, place.pass, 0 CROWD_ARGUMENTS_OF(crowds + place.slots));
-            mark_cells(params, marks, near, stored, vertex);
-            mark_cells(params, marks, near, own, vertex);
+                params, &query, block.pixel, place.pass CROWD_ARGUMENTS_OF(crowds + place.slots));
+            const CellPlace at = place_to_look_up(
+                params, &query, block.pixel, place.pass, 0 CROWD_ARGUMENTS_OF(crowds + place.slots));
+            mark_cells(params, marks, ready, stored, vertex);
+            mark_cells(params, marks, ready, at, vertex);
         }
     }
 }
@@ -114,33 +112,36 @@ static inline void store_samples(
     volatile __global CellSquares *squares,
 #endif
     __global uint *full_buckets,
-    uint first,
+    PixelQueue *queue,
+    const PixelBlock *block,
     const PassPlace *place CHANGE_BUFFER CROWD_BUFFERS WALL_BUFFERS)
 {
-    const UInt wanted = lanes_before(MASK_ALL) + first;
-    const Mask inside = wanted < params->pixel_count;
-    const UInt pixel = pick_u(inside, wanted, (UInt)(0u));
+    const UInt pixel = block->pixel;
     const UInt vertex = GATHER_U(beyond, pixel, vertex);
     const Vec3 light = demodulated(load_beyond(beyond, pixel), load_gate(vertices, pixel));
     const UInt largest = max(as_bits(light.x), max(as_bits(light.y), as_bits(light.z)));
-    Mask there = inside & (vertex != 0u);
+    Mask there = block->inside & (vertex != 0u);
+    uint lane_pixel[W];
+    store_lanes_u(pixel, lane_pixel);
     const Mask rejected = there & (largest >= as_uint(params->cell_limit));
     if (any_lane(rejected)) {
         count_up(&counters[COUNTER_REJECTED_CELLS], count_lanes(rejected));
         for (uint left = lane_bits(rejected); left; left &= left - 1u)
-            beyond[first + lowest_bit(left)].vertex |= VERTEX_REJECTED;
+            beyond[lane_pixel[lowest_bit(left)]].vertex |= VERTEX_REJECTED;
         there &= !rejected;
     }
     if (!any_lane(there))
         return;
     const CellQuery query = load_query(params, vertices, pixel, vertex, place->width);
     const CellPlace at = place_to_store(params, &query, pixel, place->pass CROWD_ARGUMENTS);
-    const UInt wall = wall_in_cell(params, there, &query, at, place->pass, pixel WALL_ARGUMENTS);
+    const Mask near = may_have_wall(params, there, at WALL_ARGUMENTS);
+    there &= !put_off(queue, block, near);
+    const UInt wall = wall_before(params, near & there, &query, at, place->pass, pixel WALL_ARGUMENTS);
     if (any_lane(wall != 0u)) {
         uint lane_wall[W];
         store_lanes_u(wall << VERTEX_WALL_SHIFT, lane_wall);
         for (uint left = lane_bits(wall != 0u); left; left &= left - 1u)
-            beyond[first + lowest_bit(left)].vertex |= lane_wall[lowest_bit(left)];
+            beyond[lane_pixel[lowest_bit(left)]].vertex |= lane_wall[lowest_bit(left)];
     }
     const CellKey key = cell_key(params, &query, at, wall);
 
@@ -178,7 +179,7 @@ static inline void store_samples(
     uint lane_slot[W];
     uint lane_same[W];
     store_lanes_u(key.bucket, lane_bucket);
-    uint left = claim_lanes(keys, cells, lane_bits(there), key.bucket, key.key, size, lane_slot, lane_same);
+    uint left = claim_lanes(keys, cells, there, key.bucket, key.key, size, lane_slot, lane_same);
     uint failed = 0;
     for (; left; left &= left - 1u) {
         const uint i = lowest_bit(left);
@@ -196,8 +197,9 @@ static inline void store_samples(
                 atomic_max(&cells[slot].change, as_uint(change));
 #endif
 #if AOV_CELLS
-            const ulong square = sum_lanes(lane_same[i], lane_square_low, lane_square_high);
-            add_fixed(&squares[slot].low, &squares[slot].high, (uint)square, (uint)(square >> 32));
+            for (uint same = lane_same[i]; same; same &= same - 1u)
+                add_fixed(&squares[slot].low, &squares[slot].high, lane_square_low[lowest_bit(same)],
+                          lane_square_high[lowest_bit(same)]);
 #endif
         }
     }
@@ -225,18 +227,19 @@ kernel void store_cells(
 #endif
     __global uint *full_buckets CHANGE_BUFFER CROWD_BUFFERS WALL_BUFFERS)
 {
-    const uint first = get_global_id(0) * (W * RUN);
-    const uint end = min(first + W * RUN, params->pixel_count);
-    const uint passes = first < end ? complete_passes(params, counters) : 0u;
+    const PixelQueue own = pixel_queue(params->pixel_count);
+    const uint passes = own.next < own.end ? complete_passes(params, counters) : 0u;
     for (uint k = 0; k < passes; ++k) {
         const PassPlace place = place_of(params, counters[COUNTER_FILM_PASS] + k);
-        for (uint i = first; i < end; i += W)
+        PixelQueue queue = own;
+        PixelBlock block;
+        while (take_block(&queue, &block))
             store_samples(params, beyond + place.samples, vertices + place.samples, counters,
                           cell_keys + place.slots, cells + place.slots,
 #if AOV_CELLS
                           cell_squares + place.slots,
 #endif
-                          full_buckets + place.buckets, i,
+                          full_buckets + place.buckets, &queue, &block,
                           &place CHANGE_ARGUMENT CROWD_ARGUMENTS_OF(crowds + place.slots)
                                   WALL_ARGUMENTS_OF(near_cells + place.slots));
     }
@@ -340,21 +343,25 @@ static inline void look_up_samples(
     __global SharedLight *shared,
 #endif
     __global float *samples,
-    uint first,
+    PixelQueue *queue,
+    const PixelBlock *block,
     const PassPlace *place KNOWN_BUFFERS CROWD_BUFFERS WALL_BUFFERS)
 {
-    const UInt inside = lanes_before(MASK_ALL) + first;
-    const UInt pixel = pick_u(inside < params->pixel_count, inside, (UInt)(0u));
+    const UInt pixel = block->pixel;
     const UInt vertex = GATHER_U(beyond, pixel, vertex);
-    const Mask wanted = (inside < params->pixel_count) & (vertex != 0u);
+    Mask wanted = block->inside & (vertex != 0u);
     if (!any_lane(wanted))
         return;
-    const Mask there = wanted & ((vertex & VERTEX_REJECTED) == 0u);
+    Mask there = wanted & ((vertex & VERTEX_REJECTED) == 0u);
     const CellQuery query = load_query(params, vertices, pixel, vertex, place->width);
     const uint size = bucket_size(params->cell_slots);
     const CellPlace at =
         place_to_look_up(params, &query, pixel, place->pass, params->cell_flags & CELL_JITTER CROWD_ARGUMENTS);
-    const UInt wall = wall_in_cell(params, there, &query, at, place->pass, pixel WALL_ARGUMENTS);
+    const Mask near = may_have_wall(params, there, at WALL_ARGUMENTS);
+    const Mask later = put_off(queue, block, near);
+    wanted &= !later;
+    there &= !later;
+    const UInt wall = wall_before(params, near & there, &query, at, place->pass, pixel WALL_ARGUMENTS);
     CellKey key = cell_key(params, &query, at, wall);
     UInt slot = find_lanes(keys, full_buckets, there, key.bucket, size, key.key);
     const Mask empty = there & (slot == NO_SLOT);
@@ -402,22 +409,25 @@ static inline void look_up_samples(
     store_lanes(known.frames, lane_before[3]);
     const uint cell_lanes = lane_bits(found);
 #endif
+    uint lane_pixel[W];
     float lane_light[3][W];
+    store_lanes_u(pixel, lane_pixel);
     store_lanes(light.x, lane_light[0]);
     store_lanes(light.y, lane_light[1]);
     store_lanes(light.z, lane_light[2]);
     for (uint left = lane_bits(wanted); left; left &= left - 1u) {
         const uint i = lowest_bit(left);
+        const uint own_pixel = lane_pixel[i];
         const float4 more = (float4)(lane_light[0][i], lane_light[1][i], lane_light[2][i], 0.0f);
-        const float4 before = vload4(first + i, samples);
-        vstore4(before + more, first + i, samples);
+        const float4 before = vload4(own_pixel, samples);
+        vstore4(before + more, own_pixel, samples);
 #if CELL_HISTORY
         if (before.w > 0.0f && (cell_lanes >> i & 1u)) {
-            __global float *sums = (__global float *)&shared[first + i];
+            __global float *sums = (__global float *)&shared[own_pixel];
             const float4 older = (float4)(lane_before[0][i], lane_before[1][i], lane_before[2][i], 1.0f);
             float4 base_part = (float4)(older.xyz, 0.0f);
 #if BASE
-            base_part *= base_share_of(beyond, seen, first + i);
+            base_part *= base_share_of(beyond, seen, own_pixel);
 #endif
             vstore4(vload4(0, sums) + (float4)(more.xyz, lane_before[3][i]), 0, sums);
             vstore4(vload4(1, sums) + older, 1, sums);
@@ -427,8 +437,8 @@ static inline void look_up_samples(
 #if RESTORE
         // Of a sample that the film does not take nothing is known.
         if (before.w > 0.0f) {
-            __global float *sums = (__global float *)&film_lost[first + i];
-            __global float *excess = (__global float *)&film_lost[params->pixel_count + first + i];
+            __global float *sums = (__global float *)&film_lost[own_pixel];
+            __global float *excess = (__global float *)&film_lost[params->pixel_count + own_pixel];
             const float4 all = (float4)(lane_lost[0][i], lane_lost[1][i], lane_lost[2][i], lane_lost[3][i]);
             // Kahan (1965): what rounding added too much goes from the next sample.
             const float4 added = all - vload4(0, excess);
@@ -439,10 +449,10 @@ static inline void look_up_samples(
 #endif
 #if AOV_CELLS
         if (before.w > 0.0f)
-            view_cell(&views[first + i], cells, squares, keys, lane_slot[i], size, place->pass == params->first_pass);
+            view_cell(&views[own_pixel], cells, squares, keys, lane_slot[i], size, place->pass == params->first_pass);
 #endif
 #if BASE
-        vstore4(vload4(first + i, base) + more * base_share_of(beyond, seen, first + i), first + i, base);
+        vstore4(vload4(own_pixel, base) + more * base_share_of(beyond, seen, own_pixel), own_pixel, base);
 #endif
     }
 }
@@ -477,12 +487,13 @@ kernel void look_up_cells(
 #endif
     __global float *samples KNOWN_BUFFERS CROWD_BUFFERS WALL_BUFFERS)
 {
-    const uint first = get_global_id(0) * (W * RUN);
-    const uint end = min(first + W * RUN, params->pixel_count);
-    const uint passes = first < end ? complete_passes(params, counters) : 0u;
+    const PixelQueue own = pixel_queue(params->pixel_count);
+    const uint passes = own.next < own.end ? complete_passes(params, counters) : 0u;
     for (uint k = 0; k < passes; ++k) {
         const PassPlace place = place_of(params, counters[COUNTER_FILM_PASS] + k);
-        for (uint i = first; i < end; i += W)
+        PixelQueue queue = own;
+        PixelBlock block;
+        while (take_block(&queue, &block))
             look_up_samples(params, beyond + place.samples, vertices + place.samples, counters,
                             cell_keys + place.slots, cells + place.slots,
 #if AOV_CELLS
@@ -498,7 +509,7 @@ kernel void look_up_cells(
 #if CELL_HISTORY
                             shared_light,
 #endif
-                            samples + 4 * place.samples, i, &place KNOWN_ARGUMENTS CROWD_ARGUMENTS_OF(crowds + place.slots)
+                            samples + 4 * place.samples, &queue, &block, &place KNOWN_ARGUMENTS CROWD_ARGUMENTS_OF(crowds + place.slots)
                                   WALL_ARGUMENTS_OF(near_cells + place.slots));
     }
 }

@@ -10,7 +10,7 @@ NO_SLOT = 0xFFFFFFFF
 FILE = "hash_map_test.cl"
 
 
-def insert(device, key, value, slots, steps, u=None):
+def insert(device, key, value, slots, steps, u=None, **defines):
     """Insert samples of ``value`` (3, n); return keys, cells, and the slot of each sample."""
     keys = device.allocate("keys", np.uint32, slots)
     cells = device.allocate("cells", layout.CELL.dtype, slots)
@@ -22,6 +22,7 @@ def insert(device, key, value, slots, steps, u=None):
         "insert_samples",
         {"key": key, "value": value, "u": u},
         {"slot": (np.uint32, 1)},
+        defines,
         keys=keys,
         cells=cells,
         slots=slots,
@@ -125,15 +126,31 @@ def test_dark_samples_alone_keep_their_mean(lane_device):
     np.testing.assert_allclose(mean, 0.002, rtol=5 / np.sqrt(0.032 * count))
 
 
-def test_words_carry(lane_device):
+#: With and without atomics of 64 bits.
+ADDS = pytest.mark.parametrize("defines", [{}, {"PLAIN_C": 1}], ids=["long", "short"])
+
+
+@ADDS
+def test_words_carry(lane_device, defines):
     count = 4096
     steps = 1.0
     value = np.full((3, count), 2.0**31, np.float32)
     value[1] = 2.0**40 + 2.0**20
     value[2] = 1.0
-    keys, cells, _ = insert(lane_device, np.zeros(count, np.uint32), value, 64, steps)
+    keys, cells, _ = insert(lane_device, np.zeros(count, np.uint32), value, 64, steps, **defines)
     expected = [count << 31, count * ((1 << 40) + (1 << 20)), count]
     assert total(cells)[keys != 0].tolist() == [expected]
+
+
+@ADDS
+def test_a_carry_that_fills_the_word_beside_it_stays_in_its_own_sum(lane_device, defines):
+    value = np.zeros((3, planes.MULTIPLE), np.float32)
+    # Two work items: whichever comes second carries out of red where green has all bits set.
+    value[0, [0, 16]] = 2.0**31
+    value[1, [0, 16]] = 2.0**32 - 256.0, 255.0
+    zeros = np.zeros(value.shape[1], np.uint32)
+    keys, cells, _ = insert(lane_device, zeros, value, 64, 1.0, **defines)
+    assert total(cells)[keys != 0].tolist() == [[2**32, 2**32 - 1, 0]]
 
 
 @pytest.mark.parametrize("slots", [1, 2, 64, 256])

@@ -33,7 +33,7 @@ kernel void insert_samples(
             store_lanes_u((number >> 4) + c + 1u, lane_low[c]);
             store_lanes_u((UInt)(0u), lane_high[c]);
         }
-        uint left = claim_lanes(keys, cells, lane_bits(MASK_ALL), bucket, key, size, lane_slot, lane_same);
+        uint left = claim_lanes(keys, cells, MASK_ALL, bucket, key, size, lane_slot, lane_same);
         for (; left; left &= left - 1u) {
             const uint i = lowest_bit(left);
             if (lane_slot[i] == NO_SLOT)
@@ -46,7 +46,7 @@ kernel void insert_samples(
         atomic_add(failed, lost);
 }
 
-/// Add to the four words of the cells that the keys name, without a search; as many samples.
+/// Add to the four words of the cells that the keys name, without a search; as many samples, and as many atomics.
 ///
 /// writes  cells
 kernel void add_bare(volatile global Cell *cells, const uint slots, const uint distinct)
@@ -59,9 +59,9 @@ kernel void add_bare(volatile global Cell *cells, const uint slots, const uint d
         store_lanes_u((number >> 4) + 1u, lane_value);
         for (uint i = 0; i < W; ++i) {
             volatile global Cell *cell = &cells[lane_slot[i]];
-            for (uint c = 0; c < 3; ++c)
-                atomic_add(&cell->low[c], lane_value[i] + c);
-            atomic_inc(&cell->count);
+            uint none;
+            add_words(&cell->low[0], lane_value[i], lane_value[i] + 1u, &none);
+            add_words(&cell->low[2], lane_value[i] + 2u, 1u, &none);
         }
     }
 }

@@ -126,7 +126,7 @@ static inline CellPlace cell_place(
         const Float ratio = sqrt(dot3(after, after) / max(dot3(before, before), 1e-30f));
         level = cell_level(pick(q->seen, q->width * ratio, q->width), dither) + raise;
     }
-    const Float inverse = 1.0f / cell_edge(level);
+    const Float inverse = from_bits(((UInt)(254u) - level) << 23);
     CellPlace place;
     place.x = nearest(p.x * inverse - CELL_SHIFT_X);
     place.y = nearest(p.y * inverse - CELL_SHIFT_Y);

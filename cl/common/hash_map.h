@@ -11,6 +11,7 @@
 #include "lanes.h"
 #include "layout.h"
 #include "rng.h"
+#include "word_pairs.h"
 
 #define NO_SLOT 0xffffffffu
 
@@ -203,24 +204,27 @@ static inline void count_up(volatile __global uint *words, uint more) { add_fixe
 static inline uint claim_lanes(
     volatile __global uint *keys,
     const volatile __global Cell *cells,
-    uint wanted,
+    Mask wanted,
     UInt bucket,
     UInt key,
     uint size,
     uint *lane_slot,
     uint *lane_same)
 {
+    const UInt there = find_in_buckets((const __global uint *)keys, wanted, bucket, size, key);
     uint lane_bucket[W];
     uint lane_key[W];
     store_lanes_u(bucket, lane_bucket);
     store_lanes_u(key, lane_key);
+    store_lanes_u(there, lane_slot);
     uint firsts = 0;
-    for (uint left = wanted; left;) {
+    for (uint left = lane_bits(wanted); left;) {
         const uint i = lowest_bit(left);
         lane_same[i] = left & lane_bits((bucket == lane_bucket[i]) & (key == lane_key[i]));
         left &= ~lane_same[i];
         firsts |= 1u << i;
-        lane_slot[i] = find_or_insert(keys, lane_bucket[i], size, lane_key[i]);
+        if (lane_slot[i] == NO_SLOT)
+            lane_slot[i] = find_or_insert(keys, lane_bucket[i], size, lane_key[i]);
         if (lane_slot[i] != NO_SLOT)
             (void)LOOK(&cells[lane_slot[i]].count);
     }
@@ -230,29 +234,27 @@ static inline uint claim_lanes(
 /// Add samples, `count` of them, whose radiance sums up to the fixed-point numbers given, to a cell.
 static inline void add_to_cell(volatile __global Cell *cell, const ulong *sum, uint count)
 {
-    for (uint c = 0; c < 3; ++c)
-        add_fixed(&cell->low[c], &cell->high[c], (uint)sum[c], (uint)(sum[c] >> 32));
-    atomic_add(&cell->count, count);
-}
-
-/// Sum of the fixed-point numbers of the lanes in `bits`.
-static inline ulong sum_lanes(uint bits, const uint *low, const uint *high)
-{
-    ulong sum_low = 0;
-    ulong sum_high = 0;
-    for (uint left = bits; left; left &= left - 1u) {
-        const uint k = lowest_bit(left);
-        sum_low += low[k];
-        sum_high += high[k];
-    }
-    return sum_low + (sum_high << 32);
+    uint carry_1;
+    uint none;
+    const uint high_0 = (uint)(sum[0] >> 32) + add_words(&cell->low[0], (uint)sum[0], (uint)sum[1], &carry_1);
+    const uint high_1 = (uint)(sum[1] >> 32) + carry_1;
+    const uint high_2 = (uint)(sum[2] >> 32) + add_words(&cell->low[2], (uint)sum[2], count, &none);
+    if ((high_0 | high_1) != 0u)
+        add_words(&cell->high[0], high_0, high_1, &none);
+    if (high_2 != 0u)
+        atomic_add(&cell->high[2], high_2);
 }
 
 /// Add the samples of the lanes in `bits`, fixed-point numbers, to a cell.
 static inline void add_lanes(
     volatile __global Cell *cell, uint bits, const uint (*low)[W], const uint (*high)[W])
 {
-    const ulong sum[3] = {sum_lanes(bits, low[0], high[0]), sum_lanes(bits, low[1], high[1]),
-                          sum_lanes(bits, low[2], high[2])};
+    ulong sum[3] = {0, 0, 0};
+    for (uint left = bits; left; left &= left - 1u) {
+        const uint k = lowest_bit(left);
+        sum[0] += (ulong)high[0][k] << 32 | low[0][k];
+        sum[1] += (ulong)high[1][k] << 32 | low[1][k];
+        sum[2] += (ulong)high[2][k] << 32 | low[2][k];
+    }
     add_to_cell(cell, sum, popcount(bits));
 }

@@ -46,9 +46,16 @@ static inline void mark_cells(
     }
 }
 
+/// Lanes of `mask` in whose cells opposite sides were seen: a wall may be in between.
+static inline Mask may_have_wall(__global const Params *params, Mask mask, CellPlace place WALL_BUFFERS)
+{
+    const UInt sides = GATHER_WORD(near_cells, entry_of(params, place));
+    return mask & ((sides & (sides >> 1) & 0x15u) != 0u);
+}
+
 /// Return what separates points from the middles of their cells: 0 for nothing, or 1 + the side of the cube
 /// that what is in between faces.
-LARGE_FUNCTION UInt wall_before(
+LARGE_FUNCTION UInt walls_met(
     __global const Params *params, Mask mask, const CellQuery *query, CellPlace place, UInt seed WALL_BUFFERS)
 {
 #if ALPHA == 2
@@ -69,20 +76,19 @@ LARGE_FUNCTION UInt wall_before(
     return pick_u(hit, 1u + cube_face(s.ng), (UInt)(0u));
 }
 
-/// The same for the lanes of `mask` in whose cells opposite sides were seen; 0 for the others.
-static inline UInt wall_in_cell(
+/// The same for the lanes of `mask`; 0 for the others.
+static inline UInt wall_before(
     __global const Params *params, Mask mask, const CellQuery *query, CellPlace place, uint pass, UInt pixel WALL_BUFFERS)
 {
-    const UInt sides = GATHER_WORD(near_cells, entry_of(params, place));
-    const Mask near = mask & ((sides & (sides >> 1) & 0x15u) != 0u);
-    if (!any_lane(near))
+    if (!any_lane(mask))
         return (UInt)(0u);
-    return wall_before(params, near, query, place, mix_bits(pixel * 0x9e3779b9u + pass) WALL_ARGUMENTS);
+    return walls_met(params, mask, query, place, mix_bits(pixel * 0x9e3779b9u + pass) WALL_ARGUMENTS);
 }
 
 #else
 #define WALL_BUFFERS
 #define WALL_ARGUMENTS_OF(marks)
 #define WALL_ARGUMENTS
-#define wall_in_cell(params, mask, query, place, pass, pixel) ((UInt)(0u))
+#define may_have_wall(params, mask, place) ((Mask)(0))
+#define wall_before(params, mask, query, place, pass, pixel) ((UInt)(0u))
 #endif
