@@ -8,7 +8,6 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
 
 
 @dataclass(frozen=True)
@@ -82,12 +81,16 @@ def schlick(f0, f90, cosine):
     return f0 + (f90 - f0) * (1 - np.clip(cosine, 0, 1)) ** 5
 
 
-def dielectric(b: Bsdf, cosine: np.ndarray, raised: np.ndarray | float = 1.0) -> np.ndarray:
-    """Schlick where opaque, Fresnel where clear, which is raised; all of what cannot pass."""
+def clear(b: Bsdf, cosine: np.ndarray) -> np.ndarray:
+    """Fresnel's reflectance, of which specular is a factor; all of what cannot pass."""
+    f = fresnel(cosine, b.eta)
+    return f * np.where(f < 1, b.specular, 1.0)
+
+
+def dielectric(b: Bsdf, cosine: np.ndarray) -> np.ndarray:
+    """Schlick where opaque, Fresnel where clear."""
     opaque = schlick(b.f0, b.specular, cosine)
-    clear = fresnel(cosine, b.eta)
-    clear = clear * np.where(clear < 1, b.specular, 1.0) * raised
-    return (1 - b.transmission) * opaque + b.transmission * clear
+    return (1 - b.transmission) * opaque + b.transmission * clear(b, cosine)
 
 
 def ggx(h: np.ndarray, alpha: float) -> np.ndarray:
@@ -115,8 +118,12 @@ def eval_reflection(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
     metal = schlick(base, 1.0, cosine[..., None]) * (
         1 + base * metal_gain(b, wo[..., 2])[..., None]
     )
-    clear = dielectric(b, cosine, glass_raise(b, wo[..., 2]))
-    f = (1 - b.metallic) * clear[..., None] + b.metallic * metal
+    reflectance = dielectric(b, cosine)
+    if is_rough_glass(b):
+        opaque = schlick(b.f0, b.specular, cosine)
+        mirrored = shares_of_facet(b, wo, h)[0]
+        reflectance = (1 - b.transmission) * opaque + b.transmission * mirrored
+    f = (1 - b.metallic) * reflectance[..., None] + b.metallic * metal
     with np.errstate(all="ignore"):
         g = masking_shadowing(wo, wi, b.alpha)
         value = ggx(h, b.alpha) * g / (4 * wo[..., 2] * wi[..., 2]) * wi[..., 2]
@@ -178,29 +185,6 @@ def metal_gain(b: Bsdf, cosine: np.ndarray) -> np.ndarray:
     return (1 - kept) / kept
 
 
-def looked_up(name: str, shape: str, *places: np.ndarray | float) -> np.ndarray:
-    """Return what a table has at ``places``, in [0, 1] along each axis, by SciPy."""
-    size = albedo_tables()[f"{shape}_SHAPE"].astype(int)
-    axes = [np.linspace(0, 1, n) for n in size]
-    table = albedo_tables()[f"{name}_TABLE"].reshape(size) / 65535
-    points = np.stack(np.broadcast_arrays(*places), axis=-1)
-    return RegularGridInterpolator(axes, table)(np.clip(points, 0, 1)).reshape(points.shape[:-1])
-
-
-def glass_raise(b: Bsdf, cosine: np.ndarray) -> np.ndarray:
-    """Return the factor of both lobes of solid glass."""
-    cosine = np.maximum(np.asarray(cosine, float), 0.0)
-    if b.transmission == 0 or b.metallic == 1 or b.alpha <= 2e-3:
-        return np.ones_like(cosine)
-    x = (b.eta - 1) / (b.eta + 1)
-    t = np.sign(x) * np.sqrt(min(abs(x) * 1.5, 1))
-    along = np.sqrt(cosine * (1 + b.alpha) / (cosine + b.alpha))
-    places = (along, b.alpha**0.5, (t + 1) / 2)
-    kept = b.specular * looked_up("GLASS", "GLASS", *places)
-    kept = kept + (1 - b.specular) * looked_up("BARE_GLASS", "GLASS", *places)
-    return 1 / np.maximum(kept, 0.05)
-
-
 def average_coat_albedo(b: Bsdf) -> float:
     """The renderer's fit; a test holds it against the mean of coat_albedo."""
     mirror = polynomial(2 * b.alpha**0.5 - 1, albedo_tables()["MIRROR_MEAN_FIT"][0])
@@ -230,19 +214,86 @@ def eval_refraction(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
         h = refraction_normal(b, wo, wi)
         oh, ih = dot(wo, h), dot(wi, h)
         # Equation 21 with wo as its i (index 1) and wi as its o (index eta).
-        bent = np.abs(oh * ih) / np.abs(wo[..., 2] * wi[..., 2])
-        bent = bent * b.eta**2 / (oh + b.eta * ih) ** 2
+        value = np.abs(oh * ih) / np.abs(wo[..., 2] * wi[..., 2])
+        value = value * b.eta**2 / (oh + b.eta * ih) ** 2 * ggx(h, b.alpha)
+        passes = shares_of_facet(b, wo, h)[1] if is_rough_glass(b) else 1 - clear(b, oh)
         mirrored = wi * np.array([1, 1, -1])
-        value = bent * (1 - b.specular * fresnel(oh, b.eta)) * ggx(h, b.alpha)
-        value = value * masking_shadowing(wo, mirrored, b.alpha) * np.abs(wi[..., 2]) / b.eta**2
-    value = value * (1 - b.metallic) * b.transmission * glass_raise(b, wo[..., 2])
+        masking = masking_shadowing(wo, mirrored, b.alpha)
+        value = value * passes * masking * np.abs(wi[..., 2]) / b.eta**2
+    value = value * (1 - b.metallic) * b.transmission
     meets = (wi[..., 2] < 0) & (oh > 0) & (ih < 0)
     return np.where(meets, value, 0)[..., None] * np.array(b.base_color)
 
 
+# --- Rough glass: what the head of cl/common/glass.h says
+
+
+def is_rough_glass(b: Bsdf) -> bool:
+    return b.transmission > 0 and b.metallic < 1 and b.alpha > 2e-3
+
+
+def shares_of_facet(b: Bsdf, wo: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the factors of Smith's masking on a facet's mirrored and on its bent way."""
+    up, down = reflect(wo, h), refract(wo, h, b.eta)
+    closed = down[..., 2] >= 0
+    f = np.where(closed, 1.0, b.specular * fresnel(dot(wo, h), b.eta))
+    seen = 1 / (1 + smith_lambda(wo, b.alpha))
+    with np.errstate(all="ignore"):
+        above = np.where(up[..., 2] > 0, masking_shadowing(wo, up, b.alpha) / seen, 0)
+        below = np.where(closed, 0, masking_shadowing(wo, down, b.alpha) / seen)
+    kept = f * above + (1 - f) * below
+    return f / np.maximum(kept, 1e-9), (1 - f) / np.maximum(kept, 1e-9)
+
+
+def thrown_down(b: Bsdf, wo: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """Density of visible facets' mirrored directions from which no bent one leads away.
+
+    Walter 2007, equation 14; 0 where such a direction leads up.
+    """
+    with np.errstate(all="ignore"):
+        h = unit(wo + down)
+        density = ggx(h, b.alpha) / (1 + smith_lambda(wo, b.alpha)) / wo[..., 2] / 4
+        there = (down[..., 2] < 0) & (h[..., 2] > 0) & (refract(wo, h, b.eta)[..., 2] >= 0)
+    return np.where(there, density if is_rough_glass(b) else 0.0, 0.0)
+
+
+def through_boundary(b: Bsdf, wi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return whence a smooth boundary bends light to wi below, and solid angles there over here.
+
+    By Snell's law, of which the ratio is the derivative; 0 where it has no answer.
+    """
+    x, y = b.eta * wi[..., 0], b.eta * wi[..., 1]
+    z2 = 1 - x**2 - y**2
+    z = -np.sqrt(np.where(z2 > 0, z2, 1.0))
+    return np.stack([x, y, z], axis=-1), np.where(z2 > 0, b.eta**2 * wi[..., 2] / z, 0.0)
+
+
+def eval_returned(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
+    """Return what is thrown down and reflected by the boundary, ``(..., 3)``."""
+    down = wi * np.array([1, 1, -1])
+    value = thrown_down(b, wo, down) * clear(b, wi[..., 2])
+    return ((1 - b.metallic) * b.transmission * value)[..., None] * np.ones(3)
+
+
+def eval_thrown(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
+    """Return what is thrown down and passes the boundary, as radiance, ``(..., 3)``."""
+    down, ratio = through_boundary(b, wi)
+    value = thrown_down(b, wo, down) * (1 - clear(b, -down[..., 2])) * ratio / b.eta**2
+    value = np.where(wi[..., 2] < 0, (1 - b.metallic) * b.transmission * value, 0)
+    return value[..., None] * np.array(b.base_color)
+
+
+def pdf_thrown(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
+    """Density of what the boundary lets pass, and of what it reflects in whole."""
+    down, ratio = through_boundary(b, wi)
+    back = thrown_down(b, wo, wi * np.array([1, 1, -1]))
+    total = 1 - wi[..., 2] ** 2 >= b.eta**2
+    return np.where(wi[..., 2] < 0, thrown_down(b, wo, down) * ratio, np.where(total, back, 0))
+
+
 def evaluate(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
     """Return f times |cos wi|, ``(..., 3)``."""
-    return eval_reflection(b, wo, wi) + eval_diffuse(b, wo, wi) + eval_refraction(b, wo, wi)
+    return sum(value(b, wo, wi) for value in VALUES.values())
 
 
 def pdf_reflection(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
@@ -257,24 +308,26 @@ def pdf_reflection(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
 
 
 def pdf_refraction(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
-    """Visible normals (Heitz 2014, equation 16), by Walter 2007, equation 17.
+    """Where a visible normal lets nothing pass, it reflects, and what it throws down goes on."""
+    return pdf_bent(b, wo, wi) + pdf_total_reflection(b, wo, wi) + pdf_thrown(b, wo, wi)
 
-    Where such a normal reflects all, it reflects.
-    """
+
+def pdf_bent(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
+    """Visible normals (Heitz 2014, equation 16), by Walter 2007, equation 17."""
     with np.errstate(all="ignore"):
         h = refraction_normal(b, wo, wi)
         oh, ih = dot(wo, h), dot(wi, h)
         visible = ggx(h, b.alpha) * oh / (1 + smith_lambda(wo, b.alpha)) / wo[..., 2]
         pdf = visible * b.eta**2 * np.abs(ih) / (oh + b.eta * ih) ** 2
-    return np.where((wi[..., 2] < 0) & (oh > 0) & (ih < 0), pdf, pdf_total_reflection(b, wo, wi))
+    return np.where((wi[..., 2] < 0) & (oh > 0) & (ih < 0), pdf, 0)
 
 
 def pdf_total_reflection(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
-    """Visible normals again, by Walter 2007, equation 14; 0 but where Snell's law has no answer."""
+    """Visible normals again, by Walter 2007, equation 14; 0 but where nothing can pass."""
     h = unit(wo + wi)
-    oh = dot(wo, h)
     visible = ggx(h, b.alpha) / (1 + smith_lambda(wo, b.alpha)) / wo[..., 2]
-    return np.where((wi[..., 2] > 0) & (1 - oh**2 >= b.eta**2), visible / 4, 0)
+    closed = refract(wo, h, b.eta)[..., 2] >= 0
+    return np.where((wi[..., 2] > 0) & closed, visible / 4, 0)
 
 
 def pdf_diffuse(b: Bsdf, wo: np.ndarray, wi: np.ndarray) -> np.ndarray:
@@ -306,6 +359,9 @@ def place_of(h: np.ndarray, alpha: float) -> tuple[np.ndarray, np.ndarray]:
     return slope2 / (1 + slope2), np.arctan2(h[..., 1], h[..., 0]) % (2 * np.pi)
 
 
+UP = np.array([0.0, 0.0, 1.0])
+
+
 class Lobe:
     """One lobe as a map from the unit square, with the solid angle that a cell of it covers.
 
@@ -313,7 +369,7 @@ class Lobe:
     shared with what is tested.
 
     Args:
-        kind: "reflect", "refract" or "diffuse".
+        kind: "reflect", "refract", "diffuse", "returned" or "thrown".
         cells: bins along each side.
         fine: quadrature points along each side of a bin.
     """
@@ -336,7 +392,7 @@ class Lobe:
         self.solid_angle = np.where(known, area / (2 * step * side) ** 2, 0)
 
     def mask(self, wi: np.ndarray) -> np.ndarray:
-        return wi[..., 2] < 0 if self.kind == "refract" else wi[..., 2] > 0
+        return wi[..., 2] < 0 if self.kind in ("refract", "thrown") else wi[..., 2] > 0
 
     def direction(self, s: np.ndarray, t: np.ndarray) -> np.ndarray:
         if self.kind == "diffuse":
@@ -346,7 +402,12 @@ class Lobe:
             )
         # Squared at the end: normals near the horizon are seen from grazing directions.
         h = normal_at(1 - (1 - s) ** 2, 2 * np.pi * t, self.b.alpha)
-        return reflect(self.wo, h) if self.kind == "reflect" else refract(self.wo, h, self.b.eta)
+        if self.kind == "refract":
+            return refract(self.wo, h, self.b.eta)
+        mirrored = reflect(self.wo, h)
+        if self.kind == "returned":
+            return mirrored * np.array([1, 1, -1])
+        return refract(mirrored * -1, UP, self.b.eta) if self.kind == "thrown" else mirrored
 
     def bin_of(self, wi: np.ndarray) -> np.ndarray:
         """Index of the bin that each direction is in, ``cells^2`` where it is not of the lobe."""
@@ -363,6 +424,9 @@ class Lobe:
                 )
                 t, phi = place_of(h, self.b.alpha)
                 s = 1 - np.sqrt(np.maximum(1 - t, 0))
+                if self.kind == "refract":
+                    # Facets of glass throw light where none of them bends it to.
+                    s = np.where((dot(self.wo, h) > 0) & (dot(wi, h) < 0), s, np.nan)
         inside = self.mask(wi) & np.isfinite(s)
         row = np.clip(np.where(inside, s, 0) * self.cells, 0, self.cells - 1).astype(int)
         column = np.clip(phi / (2 * np.pi) * self.cells, 0, self.cells - 1)
@@ -383,7 +447,13 @@ class Lobe:
 
 
 PDFS = {"reflect": pdf_reflection, "refract": pdf_refraction, "diffuse": pdf_diffuse}
-VALUES = {"reflect": eval_reflection, "refract": eval_refraction, "diffuse": eval_diffuse}
+VALUES = {
+    "reflect": eval_reflection,
+    "refract": eval_refraction,
+    "diffuse": eval_diffuse,
+    "returned": eval_returned,
+    "thrown": eval_thrown,
+}
 
 
 def albedo(b: Bsdf, wo: np.ndarray) -> np.ndarray:
@@ -391,6 +461,7 @@ def albedo(b: Bsdf, wo: np.ndarray) -> np.ndarray:
     kinds = ["reflect"]
     kinds += ["diffuse"] if b.metallic < 1 and b.transmission < 1 else []
     kinds += ["refract"] if b.metallic < 1 and b.transmission > 0 else []
+    kinds += ["returned", "thrown"] if is_rough_glass(b) and b.eta < 1 else []
     return sum(Lobe(kind, b, wo, cells=1, fine=160).integrate(VALUES[kind])[0] for kind in kinds)
 
 

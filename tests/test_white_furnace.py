@@ -12,6 +12,7 @@ from test_bsdf_layers import record, sample
 #: From straight above to 89 degrees from the normal.
 COSINES = (1.0, 0.7, 0.3, 0.1, 0.0175)
 ROUGHNESSES = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 1.0)
+IORS = (1.0001, 1.05, 1.1, 1.33, 1.5, 2.4, 5.0)
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 
 KINDS = {
@@ -25,6 +26,8 @@ KINDS = {
     "half clear": {"transmission": 0.5},
     "half reflecting glass": {"transmission": 1.0, "specular": 0.5},
     "bare glass from inside": {"transmission": 1.0, "specular": 0.0, "entering": False},
+    "stretched glass": {"transmission": 1.0, "anisotropy": 0.6},
+    "stretched glass from inside": {"transmission": 1.0, "anisotropy": 1.0, "entering": False},
     "sheet": {"transmission": 1.0, "thin": True},
     "stretched sheet": {"transmission": 1.0, "thin": True, "anisotropy": 0.5},
     "coated": {"coat": 1.0, "coat_roughness": 0.4},
@@ -35,7 +38,7 @@ KINDS = {
 }
 
 
-def furnace(device, records, wo, count=2048, rounds=4):
+def furnace(device, records, wo, count=512, rounds=8):
     """Return what comes back of white light, ``(n,)``, and how far that is known.
 
     Power, not radiance: what passes into glass is multiplied with the square of the index.
@@ -53,25 +56,26 @@ def furnace(device, records, wo, count=2048, rounds=4):
     return np.mean(means, axis=0), np.std(means, axis=0, ddof=1) / np.sqrt(rounds)
 
 
-#: What may be lost where the tables are coarse: where most changes, and from inside.
+#: What may be lost where the table of two widths and two angles is coarse.
 LOST = {
+    "stretched metal": 0.015,
     "most stretched metal": 0.015,
     "stretched dielectric": 0.015,
-    "glass from inside": 0.02,
-    "bare glass from inside": 0.05,
+    "stretched sheet": 0.015,
 }
 
 
+@pytest.mark.parametrize("iors", [(1.1, 1.5, 2.4), pytest.param(IORS, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", KINDS)
-def test_white_conserves(device, kind):
+def test_white_conserves(device, kind, iors):
     turns = (0.0, 0.7, 1.5708) if "stretched" in kind else (0.7,)
-    cases = list(itertools.product(ROUGHNESSES, (1.3, 1.5, 2.4), COSINES, turns))
+    cases = list(itertools.product(ROUGHNESSES, iors, COSINES, turns))
     records = np.array([record(roughness=r, ior=n, **KINDS[kind]) for r, n, _, _ in cases])
     wo = np.array([direction(cosine, turn) for _, _, cosine, turn in cases])
-    returned, deviation = furnace(device, records, wo, count=1024)
-    over = returned - 1.001 - 4 * deviation
+    returned, deviation = furnace(device, records, wo)
+    over = returned - 1.001 - 5 * deviation
     assert over.max() < 0, (cases[over.argmax()], returned[over.argmax()])
-    under = 1 - LOST.get(kind, 0.01) - returned - 4 * deviation
+    under = 1 - LOST.get(kind, 0.01) - returned - 5 * deviation
     assert under.max() < 0, (cases[under.argmax()], returned[under.argmax()])
 
 
@@ -84,7 +88,7 @@ def grid_records(count):
         "transmission": (0.0, 0.5, 1.0),
         "shape": ((True, False), (False, False), (True, True)),
         "specular": (0.0, 0.5, 1.0),
-        "ior": (1.3, 1.5, 2.4),
+        "ior": IORS,
         "coat": (0.0, 0.5, 1.0),
         "coat_roughness": (0.0, 0.3, 0.6, 1.0),
         "sheen": (BLACK, (0.5,) * 3, WHITE),
@@ -101,21 +105,19 @@ def grid_records(count):
 
 @pytest.mark.parametrize("count", [300, pytest.param(6000, marks=pytest.mark.slow)])
 def test_no_combination_gains_or_loses_energy(device, count):
-    """Places of a grid over all parameters; stretched solid glass loses more, and is known to."""
+    """Places of a grid over all parameters."""
     made, records = grid_records(count)
     rng = np.random.default_rng(9)
     cosines = rng.choice(COSINES, count)
     wo = np.array(
         [direction(c, t) for c, t in zip(cosines, rng.uniform(0, 6.28, count), strict=True)]
     )
-    returned, deviation = furnace(device, records, wo, count=1024)
+    returned, deviation = furnace(device, records, wo)
     over = returned - 1.001 - 5 * deviation
     assert over.max() < 0, (made[over.argmax()], cosines[over.argmax()], returned[over.argmax()])
-    glass = np.array([row["transmission"] > 0 and not row["thin"] for row in made])
-    inside = glass & np.array([not row["entering"] for row in made])
-    stretched = np.array([row["anisotropy"] > 0 for row in made])
-    lost = np.where(inside, 0.05, np.where(stretched, 0.015, 0.01))
-    under = np.where(glass & stretched, -1, 1 - lost - returned - 5 * deviation)
+    glass = np.array([row["transmission"] == 1 and not row["thin"] for row in made])
+    stretched = np.array([row["anisotropy"] > 0 for row in made]) & ~glass
+    under = 1 - np.where(stretched, 0.015, 0.01) - returned - 5 * deviation
     assert under.max() < 0, (
         made[under.argmax()],
         cosines[under.argmax()],
@@ -123,11 +125,29 @@ def test_no_combination_gains_or_loses_energy(device, count):
     )
 
 
-def test_with_few_constants_tables_fit_into_what_any_device_has():
-    """Without that of glass that does not reflect, which is left out beside layers then."""
+@pytest.mark.parametrize("roughness", [0.5, 1.0])
+@pytest.mark.parametrize("ior", [1.5, 2.4])
+def test_as_much_light_enters_rough_glass_as_leaves_it_in_balance(device, ior, roughness):
+    """Between the same radiance over the squared index on both sides; to 12 per cent.
+
+    What is given back in proportion to what single facets leave is up to 1.9 times out of balance.
+    """
+    count = 1 << 16
+    numbers = qmc.Sobol(5, rng=np.random.default_rng(1)).random(count)
+    sine, turn = np.sqrt(numbers[:, 3]), 2 * np.pi * numbers[:, 4]
+    wo = np.column_stack([sine * np.cos(turn), sine * np.sin(turn), np.sqrt(1 - numbers[:, 3])])
+    passes = {}
+    for entering in (True, False):
+        glass = record(roughness=roughness, ior=ior, transmission=1.0, entering=entering)
+        wi, values, pdfs = sample(device, np.tile(glass, (count, 1)), wo, numbers[:, :3])
+        power = np.where((wi[:, 2] < 0) & (pdfs > 0), values[:, 0] / np.maximum(pdfs, 1e-30), 0)
+        passes[entering] = power.mean(dtype=np.float64) * glass[8] ** 2
+    np.testing.assert_allclose(passes[False] * ior**2, passes[True], rtol=0.12)
+
+
+def test_tables_fit_into_the_constants_that_any_device_has():
+    """OpenCL 1.2, table 4.3: CL_DEVICE_MAX_CONSTANT_BUFFER_SIZE is 64 KiB or more."""
     arrays = {k: v for k, v in albedo_tables().items() if isinstance(v, np.ndarray)}
-    assert {"GLASS_TABLE", "STRETCHED_TABLE"} < arrays.keys()
-    del arrays["BARE_GLASS_TABLE"]
-    # OpenCL 1.2, table 4.3: CL_DEVICE_MAX_CONSTANT_BUFFER_SIZE is 64 KiB or more.
+    assert {"STRETCHED_TABLE", "MIRROR_FIT"} < arrays.keys()
     words = {True: 2, False: 4}
     assert sum(v.size * words[k.endswith("_TABLE")] for k, v in arrays.items()) < 64 << 10

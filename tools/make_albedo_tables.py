@@ -2,9 +2,9 @@
 
 Light that meets a second facet is lost to a model of single facets, and what lies under a layer
 gets what the layer leaves.  So ``cl/common/albedo.h`` must know albedos: of GGX reflection and of
-sheen by polynomials, of stretched highlights and of rough glass by tables.  All of them are found
-by quadrature, fitted so that the largest error is least, and raised until they nowhere promise
-less than there is, but for ``SLACK``: for then light would be gained.
+sheen by polynomials, of stretched highlights by tables.  All are found by quadrature, fitted so
+that the largest error is least, and raised until they nowhere promise less than there is, but for
+``SLACK``: for then light would be gained.
 """
 
 from __future__ import annotations
@@ -25,9 +25,6 @@ SLACK = 0.0003
 ALPHA_MIN = 1e-3
 SHEEN_ROUGHNESS_MIN = 0.3
 
-#: (eta - 1) / (eta + 1) at the ends of the table of glass, that is, indices from 1/5 to 5.
-LARGEST = 2.0 / 3.0
-
 #: The edge's fit is in 1 / (1 + EDGE_SCALE alpha), that of sheen in cos / (cos + SHEEN_SCALE).
 EDGE_SCALE = 12.0
 SHEEN_SCALE = 0.2
@@ -43,9 +40,7 @@ Array = np.ndarray
 # --- Truth
 
 
-def visible_normals(
-    wo: Array, alpha: Array, points: int, circle: float = 1.0
-) -> tuple[Array, Array]:
+def visible_normals(wo: Array, alpha: Array, points: int) -> tuple[Array, Array]:
     """Return GGX normals that are visible from ``wo``, and the share of the view that each has.
 
     Dupuy, Benyoub, Sampling Visible GGX Normals with Spherical Caps, 2023; the cap by Gauss's
@@ -54,7 +49,6 @@ def visible_normals(
     Args:
         wo: unit directions, ``(n, 3)``.
         alpha: widths along x and y, ``(n, 2)``.
-        circle: part of it that is gone round: half of it shows all for a wo at y = 0.
 
     Returns:
         Normals ``(points^2, n, 3)`` and weights ``(points^2, 1)`` with a sum of 1.
@@ -65,7 +59,7 @@ def visible_normals(
     u1 = np.repeat(t * t * (3.0 - 2.0 * t), points)[:, None]
     # Rings are turned against each other, or a horizon that follows a row would be off by it.
     row, place = np.divmod(np.arange(points**2), points)
-    turn = (circle * 2.0 * np.pi * (place + row * 0.618034 % 1.0) / points)[:, None]
+    turn = (2.0 * np.pi * (place + row * 0.618034 % 1.0) / points)[:, None]
     view = np.column_stack([alpha * wo[:, :2], wo[:, 2]])
     view /= np.linalg.norm(view, axis=1, keepdims=True)
     z = (1.0 - u1) * (1.0 + view[:, 2]) - view[:, 2]
@@ -118,34 +112,6 @@ def reflected(
     share = np.where(wi[..., 2] > 0.0, weight * seen_too(wo, wi, alpha), 0.0)
     edge = np.clip(1.0 - along, 0.0, 1.0) ** 5
     return np.column_stack([share.sum(axis=0), (share * edge).sum(axis=0)])
-
-
-@in_parts
-def scattered_by_glass(cosine: Array, alpha: Array, eta: Array) -> Array:
-    """Return what a rough boundary reflects and refracts; Walter et al. 2007.
-
-    Args:
-        eta: index beyond the boundary over the index on the side of the direction, ``(n,)``.
-
-    Returns:
-        With Fresnel's reflection, and with only the one that is total, ``(n, 2)``.
-    """
-    alphas = np.column_stack([alpha, alpha])
-    wo = direction(cosine, np.zeros_like(cosine))
-    h, weight = visible_normals(wo, alphas, POINTS, circle=0.5)
-    along = (h * wo).sum(axis=-1)
-    sine2 = (1.0 - along**2) / eta**2
-    bent = np.sqrt(np.maximum(1.0 - sine2, 0.0))
-    parallel = (eta * along - bent) / (eta * along + bent)
-    vertical = (along - eta * bent) / (along + eta * bent)
-    fresnel = np.where(sine2 >= 1.0, 1.0, 0.5 * (parallel**2 + vertical**2))
-    up = 2.0 * along[..., None] * h - wo
-    down = h * (along / eta - bent)[..., None] - wo / eta[:, None]
-    above = np.where(up[..., 2] > 0.0, weight * seen_too(wo, up, alphas), 0.0)
-    below = np.where(down[..., 2] < 0.0, weight * seen_too(wo, down, alphas), 0.0)
-    total = sine2 >= 1.0
-    kept = fresnel * above + (1.0 - fresnel) * below
-    return np.column_stack([v.sum(axis=0) for v in (kept, np.where(total, above, below))])
 
 
 @in_parts
@@ -342,7 +308,6 @@ def table(shape: tuple[int, ...], place: Array, values: Array, tolerance: Array)
     return entries
 
 
-GLASS_SHAPE = (24, 14, 32)
 STRETCHED_SHAPE = (12, 7, 10, 10)
 
 #: Largest cosine at which stretched facets seem to be met, over the direction's cosine and width.
@@ -350,20 +315,6 @@ STRETCHED_MET = 5.0
 
 #: Places at which the tables are tried, beside their entries.
 TRIALS = 150_000
-
-
-def glass_at(place: Array) -> tuple[Array, Array, Array]:
-    """Return cosine, alpha and index of places in the table of glass, ``(n, 3)`` in [0, 1].
-
-    Lobes near the horizon look alike for one ratio of cosine and alpha, and change fast there; near
-    an index of 1 all changes fast.
-    """
-    x, roughness, t = place.T
-    alpha = np.maximum(roughness**2, ALPHA_MIN)
-    cosine = np.clip(x**2 * alpha / (1.0 + alpha - x**2), 1e-3, 1.0)
-    t = 2.0 * t - 1.0
-    y = np.sign(t) * t * t * LARGEST
-    return cosine, alpha, (1.0 + y) / (1.0 - y)
 
 
 def stretched_at(place: Array) -> tuple[Array, Array, Array, Array]:
@@ -400,28 +351,6 @@ class Table:
     what: str
     shape: tuple[int, ...]
     entries: Array
-
-
-def tables_of_glass() -> list[Table]:
-    """Return the tables of rough glass with its reflection, and without it."""
-    place = trials(GLASS_SHAPE)
-    cosine, alpha, eta = glass_at(place)
-    # Which nobody asks for: almost the horizon, and indices that hardly differ or differ too much.
-    index = np.maximum(eta, 1.0 / eta)
-    seldom = 20.0 * np.maximum(0.0172 / cosine - 1.0, 0.0) + 10.0 * np.maximum(
-        index / 3.0 - 1.0, 0.0
-    )
-    seldom += 40.0 * np.maximum(1.1 / index - 1.0, 0.0)
-    made = []
-    for name, what, values in zip(
-        ("GLASS", "BARE_GLASS"),
-        ("with Fresnel's reflection", "that reflects only what cannot pass"),
-        scattered_by_glass(cosine, alpha, eta).T,
-        strict=True,
-    ):
-        entries = table(GLASS_SHAPE, place, values, np.maximum(values, 0.05) * (1.0 + seldom))
-        made.append(Table(name, f"What rough glass {what} leaves", GLASS_SHAPE, entries))
-    return made
 
 
 def tables_of_stretched() -> list[Table]:
@@ -496,10 +425,6 @@ def header() -> str:
     ]
     for fit in (mirror, edge, mean, edge_mean):
         lines += text_of_fit(fit)
-    lines += ["#endif", "", "#if TRANSMISSION", f"#define GLASS_LARGEST {LARGEST:.9g}f"]
-    lines += [shape_of("GLASS", GLASS_SHAPE)]
-    glass, bare = tables_of_glass()
-    lines += [*text_of_table(glass), "", "#if BARE_GLASS", *text_of_table(bare), "#endif"]
     lines += ["#endif", "", "#if LAYERS", f"#define SHEEN_SCALE {SHEEN_SCALE:.1f}f"]
     lines += [f"#define SHEEN_ROUGHNESS_MIN {SHEEN_ROUGHNESS_MIN:.1f}f"]
     lines += [f"#define SHEEN_TERMS {sheen.coefficients.shape[0]}"]

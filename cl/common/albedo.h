@@ -4,12 +4,6 @@
 
 #include "lanes.h"
 
-// Devices need to have room for no more than 64 KiB of constants: some have none for the second table of glass beside
-// those of stretched highlights.
-#ifndef FEW_CONSTANTS
-#define FEW_CONSTANTS 0
-#endif
-#define BARE_GLASS (!FEW_CONSTANTS || !LAYERS)
 #include "albedo_tables.h"
 
 #if GLOSSY
@@ -102,7 +96,7 @@ static inline Float sheen_albedo(Float roughness, Float cosine)
 }
 #endif
 
-#if TRANSMISSION || LAYERS
+#if LAYERS
 #define MAX_TABLE_AXES 4
 
 /// What a table of albedo_tables.h has at `places`, in [0, 1] along each axis, between entries linearly;
@@ -145,29 +139,6 @@ static inline Float look_up(
         lane_value[k] = sum * (1.0f / 65535.0f);
     }
     return load_lanes(lane_value);
-}
-#endif
-
-#if TRANSMISSION
-/// Part of white light that one bounce on rough solid glass leaves, where it reflects `specular` of what
-/// Fresnel's equations say.
-static inline Float glass_albedo(Mask wanted, Float alpha, Float eta, Float specular, Float cosine)
-{
-    const Float x = (eta - 1.0f) / (eta + 1.0f);
-    const Float t = 0.5f * sqrt(min(fabs(x) * (1.0f / GLASS_LARGEST), (Float)(1.0f)));
-    const Float places[3] = {sqrt(cosine * (1.0f + alpha) / (cosine + alpha)), sqrt(alpha), 0.5f + pick(x < 0.0f, -t, t)};
-    Float kept = look_up(wanted, GLASS_TABLE, GLASS_SHAPE, 3, places);
-    const Mask dull = wanted & (specular < 1.0f);
-#if BARE_GLASS
-    if (any_lane(dull)) {
-        const Float bare = look_up(dull, BARE_GLASS_TABLE, GLASS_SHAPE, 3, places);
-        kept = pick(dull, bare + (kept - bare) * specular, kept);
-    }
-#else
-    // Nothing is given back.
-    kept = pick(dull, (Float)(1.0f), kept);
-#endif
-    return max(kept, 0.05f);
 }
 #endif
 

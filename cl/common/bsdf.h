@@ -9,14 +9,12 @@
 // enters through the coat and leaves through it, so a white base under any coat gives back nearly all
 // that it gets and never more (glTF's 1 - F(o.h) gains up to four fifths at grazing angles).  Kelemen,
 // Szirmay-Kalos: A Microfacet Based Coupled Specular-Matte BRDF Model, 2001.
-// GGX: Walter et al. 2007; height-correlated masking: Heitz 2014; sampled by its bounded visible
-// normals: Dupuy and Benyoub 2023, Eto and Tokuyoshi 2023.
 //
 // Scattering between facets: a metal's lobe is raised by 1 + F0 (1 - R(o)) / R(o), R the albedo of a
 // white one (Turquin: Practical Multiple Scattering Compensation for Microfacet Models, 2019), and both
-// lobes of glass by 1 / (what they leave of white light): of a sheet 1 / R, of a solid by a table.  That
-// gives up reciprocity, for no further lobe has to be drawn.  Light that can't leave a solid is
-// reflected, whatever the specular factor says.
+// lobes of a sheet by 1 / R; solid glass shares it as glass.h says.  That gives up reciprocity, for no
+// further lobe has to be drawn.  Light that can't leave a solid is reflected, whatever the specular
+// factor says.
 //
 // LAYERS: f = sheen + (1 - S(cos o)) (coat + (1 - C(cos o)) f), S and C the albedos of sheen and coat.
 // Sheen: Estevez and Kulla, Production Friendly Microfacet Sheen BRDF, 2017, with the visibility of
@@ -26,9 +24,8 @@
 #include "lanes.h"
 #include "surface.h"
 #include "albedo.h"
-
-// Below this a lobe is sharper than float can evaluate; roughness 0 is drawn with it.
-#define ALPHA_GGX_MIN 1e-3f
+#include "ggx.h"
+#include "glass.h"
 
 // Stands for the density of directions that no light is sampled for: those of delta lobes.
 #define PDF_DELTA 1e30f
@@ -40,7 +37,7 @@ typedef struct {
 #endif
 #if TRANSMISSION
     Float refract;
-    Float raised; // factor of both lobes of glass, for what scatters between facets
+    Float raised; // factor of both lobes of a sheet, for what scatters between facets
 #endif
     Float diffuse;
 #if LAYERS
@@ -99,20 +96,6 @@ static inline Float schlick(Float f0, Float f90, Float cosine)
     return f0 + (f90 - f0) * fifth_power_of_one_minus(cosine);
 }
 
-#if TRANSMISSION
-/// Reflectance of a dielectric boundary for light that meets it at `cosine` > 0, with `eta` the index
-/// beyond over the index here; 1 under total reflection.
-static inline Float fresnel_dielectric(Float cosine, Float eta)
-{
-    const Float sin2 = (1.0f - cosine * cosine) / (eta * eta);
-    const Mask total = sin2 >= 1.0f;
-    const Float cos_t = sqrt(max(1.0f - sin2, 0.0f));
-    const Float parallel = (eta * cosine - cos_t) / (eta * cosine + cos_t);
-    const Float vertical = (cosine - eta * cos_t) / (cosine + eta * cos_t);
-    return pick(total, (Float)(1.0f), 0.5f * (parallel * parallel + vertical * vertical));
-}
-#endif
-
 /// Part of the light that the rough coat of `b` reflects, of what white facets do.
 static inline Float coat_albedo(Bsdf b, Reflected r)
 {
@@ -146,21 +129,6 @@ static inline Float eval_sheen(Float roughness, Float cos_o, Float cos_i, Float 
 }
 #endif
 
-/// Reflectance of the dielectric part of `b`, where its opaque share reflects `opaque` and its clear one
-/// is raised.
-static inline Float dielectric_reflectance(Bsdf b, Float opaque, Float cosine, Float raised)
-{
-#if TRANSMISSION
-    Float clear = fresnel_dielectric(max(cosine, 1e-6f), b.eta);
-    // Between the two faces of a sheet light goes to and fro.  What can't leave a solid is reflected.
-    const Mask total = (clear >= 1.0f) & !b.thin;
-    clear = pick(b.thin, 2.0f * clear / (1.0f + clear), clear) * pick(total, (Float)(1.0f), b.specular);
-    return opaque + (clear * raised - opaque) * b.transmission;
-#else
-    return opaque;
-#endif
-}
-
 LARGE_FUNCTION LobeChances lobe_chances(Bsdf b, Vec3 wo)
 {
     LobeChances c;
@@ -187,19 +155,13 @@ LARGE_FUNCTION LobeChances lobe_chances(Bsdf b, Vec3 wo)
 #if TRANSMISSION
     c.enters *= 1.0f - b.transmission;
     c.raised = 1.0f + pick(b.thin, c.gain, (Float)(0.0f));
-    const Mask rough = (b.transmission > 0.0f) & !b.thin & (b.metallic < 1.0f) & (b.alpha > 2.0f * ALPHA_GGX_MIN);
-    if (any_lane(rough)) {
-        Float kept = glass_albedo(rough, b.alpha, b.eta, b.specular, cos_o);
-#if LAYERS
-        // There is no table of two widths: what the better one keeps, rather than too little.
-        const Mask both = rough & stretched;
-        if (any_lane(both))
-            kept = max(kept, pick(both, glass_albedo(both, b.alpha_y, b.eta, b.specular, cos_o), kept));
+    Float clear = clear_reflectance(b, cos_o);
+    // Facets of rough glass that reflect all do so whichever lobe they are drawn for.
+    clear = pick(is_rough_glass(b) & (clear >= 1.0f), max(b.f0, (Float)(0.1f)), clear);
+    const Float f = reflected + (clear - reflected) * b.transmission;
+#else
+    const Float f = reflected;
 #endif
-        c.raised = pick(rough, 1.0f / kept, c.raised);
-    }
-#endif
-    const Float f = dielectric_reflectance(b, reflected, cos_o, (Float)(1.0f));
     const Float color = max3(b.base_color);
     const Float metal_part = b.metallic * schlick(color, (Float)(1.0f), cos_o);
     const Float reflect = (1.0f - b.metallic) * f + metal_part;
@@ -263,102 +225,6 @@ static inline Mask is_delta(Bsdf b)
     return sharp;
 }
 
-// Alphas along x and y.
-#if LAYERS
-typedef struct {
-    Float x;
-    Float y;
-} Alphas;
-static inline Alphas alphas_of(Bsdf b)
-{
-    Alphas a;
-    a.x = b.alpha;
-    a.y = b.alpha_y;
-    return a;
-}
-static inline Alphas alphas_equal(Float alpha)
-{
-    Alphas a;
-    a.x = alpha;
-    a.y = alpha;
-    return a;
-}
-#define ALPHA_X(a) ((a).x)
-#define ALPHA_Y(a) ((a).y)
-#define ALPHA_LEAST(a) min((a).x, (a).y)
-#else
-typedef Float Alphas;
-static inline Alphas alphas_of(Bsdf b) { return b.alpha; }
-#define ALPHA_X(a) (a)
-#define ALPHA_Y(a) (a)
-#define ALPHA_LEAST(a) (a)
-#endif
-
-/// GGX density of the microfacet normal `h` (local, unit).  From the slopes, because 1 - h.z^2 has
-/// cancelled away where the lobe is sharp.
-static inline Float ggx_d(Vec3 h, Alphas alpha)
-{
-#if LAYERS
-    const Float x = h.x / alpha.x;
-    const Float y = h.y / alpha.y;
-    const Float e = x * x + y * y + h.z * h.z;
-    return INV_PI / (alpha.x * alpha.y * e * e);
-#else
-    const Float a2 = alpha * alpha;
-    const Float e = (h.x * h.x + h.y * h.y) / a2 + h.z * h.z;
-    return INV_PI / (a2 * e * e);
-#endif
-}
-
-/// Length of (alpha_x x, alpha_y y, z) for a unit vector.
-static inline Float ggx_stretch(Vec3 w, Alphas alpha)
-{
-#if LAYERS
-    const Float x = alpha.x * w.x;
-    const Float y = alpha.y * w.y;
-    return sqrt(x * x + y * y + w.z * w.z);
-#else
-    return sqrt(alpha * alpha * max(1.0f - w.z * w.z, 0.0f) + w.z * w.z);
-#endif
-}
-
-/// Height-correlated masking and shadowing over 4 cos_o cos_i; wi.z > 0 is given apart.
-static inline Float ggx_visibility(Vec3 wo, Vec3 wi, Float cos_i, Alphas alpha)
-{
-    const Vec3 i = vec3(wi.x, wi.y, cos_i);
-    return 0.5f / max(wo.z * ggx_stretch(i, alpha) + cos_i * ggx_stretch(wo, alpha), 1e-20f);
-}
-
-/// Share of the cap of visible normals that can reflect above the horizon (the k of Eto, Tokuyoshi).
-static inline Float ggx_bound(Vec3 wo, Alphas alpha)
-{
-    const Float s = 1.0f + sqrt(max(1.0f - wo.z * wo.z, 0.0f));
-    const Float least = ALPHA_LEAST(alpha);
-    const Float a2 = least * least;
-    const Float s2 = s * s;
-    return (1.0f - a2) * s2 / (s2 + a2 * wo.z * wo.z);
-}
-
-/// Draw a microfacet normal visible from wo; `bound` is ggx_bound for a reflection, 1 for all of them.
-static inline Vec3 sample_ggx(Vec3 wo, Alphas alpha, Float bound, Float u1, Float u2)
-{
-    const Vec3 stretched = normalize3(vec3(ALPHA_X(alpha) * wo.x, ALPHA_Y(alpha) * wo.y, wo.z));
-    const Float lowest = bound * stretched.z;
-    const Float z = (1.0f - u1) * (1.0f + lowest) - lowest;
-    const Float radius = sqrt(clamp(1.0f - z * z, (Float)(0.0f), (Float)(1.0f)));
-    Float c;
-    Float s;
-    cos_sin_turns(u2, &c, &s);
-    const Vec3 h = vec3(radius * c + stretched.x, radius * s + stretched.y, z + stretched.z);
-    return normalize3(vec3(ALPHA_X(alpha) * h.x, ALPHA_Y(alpha) * h.y, max(h.z, (Float)(1e-6f))));
-}
-
-/// Density of the direction that sample_ggx with ggx_bound reflects into.
-static inline Float pdf_ggx_reflect(Vec3 wo, Vec3 h, Alphas alpha)
-{
-    return ggx_d(h, alpha) / (2.0f * (ggx_bound(wo, alpha) * wo.z + ggx_stretch(wo, alpha)));
-}
-
 /// Factor of the light in f cos of the diffuse base; that of wo is LobeChances.enters.
 static inline Float base_light(Bsdf b, LobeChances chances, Float cos_i)
 {
@@ -408,12 +274,17 @@ LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Flo
     const Float cos_h = clamp(dot3(wo, h), (Float)(0.0f), (Float)(1.0f));
 
     const Float edge = fifth_power_of_one_minus(cos_h);
+    Float f = b.f0 + (b.specular - b.f0) * edge;
 #if TRANSMISSION
-    const Float raised = chances.raised;
-#else
-    const Float raised = (Float)(1.0f);
+    const Float share = (1.0f - b.metallic) * b.transmission;
+    const Mask rough = is_rough_glass(b);
+    const Mask inside = rough & (b.eta < 1.0f);
+    const Float single = clear_reflectance(b, cos_h);
+    Float clear = single * chances.raised;
+    if (any_lane(rough & above))
+        clear = pick(rough, shares_of_facet(b, alpha, wo, h, cos_h).mirrored, clear);
+    f += (clear - f) * b.transmission;
 #endif
-    const Float f = dielectric_reflectance(b, b.f0 + (b.specular - b.f0) * edge, cos_h, raised);
     const Vec3 white = vec3_all((Float)(1.0f));
     Vec3 metal = add_scaled(b.base_color, sub(white, b.base_color), edge);
     metal = mul(metal, add_scaled(white, b.base_color, chances.gain));
@@ -431,8 +302,14 @@ LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Flo
     density += pick(chances.reflect > 0.0f, chances.reflect * seen_mirrored, (Float)(0.0f));
 #if TRANSMISSION
     // What was to be refracted by a facet that reflects all.
-    const Mask total = (chances.refract > 0.0f) & !b.thin & (1.0f - cos_h * cos_h >= b.eta * b.eta);
-    density += pick(total, chances.refract * ggx_d(h, alpha) / (2.0f * (wo.z + ggx_stretch(wo, alpha))), (Float)(0.0f));
+    Vec3 none;
+    const Mask returns = cannot_pass(b, wo, h, cos_h, &none) & (chances.refract > 0.0f) & !b.thin;
+    density += pick(returns, chances.refract * ggx_d(h, alpha) / (2.0f * (wo.z + ggx_stretch(wo, alpha))), (Float)(0.0f));
+    if (any_lane(above & inside)) {
+        const Thrown thrown = thrown_back(b, alpha, wo, vec3(wi.x, wi.y, -cos_i));
+        value = add(value, vec3_all(pick(inside, share * thrown.light, (Float)(0.0f))));
+        density += pick(inside, chances.refract * thrown.drawn, (Float)(0.0f));
+    }
 #endif
 #if LAYERS
     value = scale(value, chances.under_coat);
@@ -453,10 +330,8 @@ LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Flo
 
 #if TRANSMISSION
     Mask passes = behind;
-    const Float share = (1.0f - b.metallic) * b.transmission;
     if (any_lane(behind)) {
-        const Float kept_back = fresnel_dielectric(cos_h, b.eta);
-        const Float sheet = (1.0f - 2.0f * kept_back / (1.0f + kept_back) * b.specular) * share * mirror * chances.raised;
+        const Float sheet = (1.0f - single) * share * mirror * chances.raised;
         value = pick_v(behind, scale(b.base_color, sheet), value);
         density = pick(behind, chances.refract * seen_mirrored, density);
     }
@@ -476,12 +351,20 @@ LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Flo
         // Masking times 1 / cos_o is 4 cos_i visibility; the radiance is compressed by 1 / eta^2.
         const Float weight = d * 4.0f * cos_t * ggx_visibility(wo, beyond, cos_t, alpha) * max(oh, 0.0f)
                              * jacobian / (b.eta * b.eta);
-        const Float through =
-            (1.0f - fresnel_dielectric(max(oh, 1e-6f), b.eta) * b.specular) * share * chances.raised;
+        Float through = 1.0f - fresnel_dielectric(max(oh, 1e-6f), b.eta) * b.specular;
+        if (any_lane(rough & meets))
+            through = pick(rough, shares_of_facet(b, alpha, wo, ht, oh).bent, through);
         const Float seen = 2.0f * d * max(oh, 0.0f) / (wo.z + ggx_stretch(wo, alpha));
-        value = pick_v(meets, scale(b.base_color, weight * through), value);
-        density = pick(meets, chances.refract * seen * jacobian, density);
-        passes |= meets;
+        Float light = pick(meets, weight * through, (Float)(0.0f));
+        Float drawn = pick(meets, seen * jacobian, (Float)(0.0f));
+        if (any_lane(bent & inside)) {
+            const Thrown thrown = thrown_through(b, alpha, wo, beyond, cos_t);
+            light += pick(inside, thrown.light, (Float)(0.0f));
+            drawn += pick(inside, thrown.drawn, (Float)(0.0f));
+        }
+        value = pick_v(bent, scale(b.base_color, light * share), value);
+        density = pick(bent, chances.refract * drawn, density);
+        passes |= bent & (drawn > 0.0f);
     }
 #if LAYERS
     value = pick_v(passes, scale(value, chances.under_coat), value);
@@ -545,14 +428,16 @@ LARGE_FUNCTION Vec3 sample_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Float u_lo
     const Float oh = dot3(wo, h);
     wi = pick_v(glossy, sub(scale(h, 2.0f * oh), wo), wi);
 #if TRANSMISSION
-    const Float cos2 = 1.0f - (1.0f - oh * oh) / (b.eta * b.eta);
-    const Mask passes = refract & (cos2 > 0.0f);
-    const Vec3 bent = add_scaled(scale(wo, -1.0f / b.eta), h, oh / b.eta - sqrt(max(cos2, 0.0f)));
+    Vec3 bent;
+    const Mask passes = refract & !cannot_pass(b, wo, h, oh, &bent);
+    const Mask thrown = refract & !passes & (wi.z < 0.0f) & is_rough_glass(b);
     wi = pick_v(passes, bent, wi);
+    if (any_lane(thrown))
+        wi = pick_v(thrown, beyond_boundary(b.eta, wi), wi);
     // A draw that crosses its lobe's horizon has failed: it is not one of the other lobe's.  One that cannot pass
     // its facet is reflected: were it lost, what is left of paths that go round in smooth glass would grow by 1 %
     // at each of a thousand bounces.
-    wi.z = pick(passes, min(wi.z, 0.0f), max(wi.z, 0.0f));
+    wi.z = pick(thrown, wi.z, pick(passes, min(wi.z, 0.0f), max(wi.z, 0.0f)));
     wi.z = pick(through & b.thin, -wi.z, wi.z);
 #endif
     return wi;

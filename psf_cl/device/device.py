@@ -100,11 +100,6 @@ class Device:
         return self.cl_device.max_mem_alloc_size
 
     @property
-    def largest_constants(self) -> int:
-        """Return the bytes that a program's constants may have."""
-        return self.cl_device.max_constant_buffer_size
-
-    @property
     def driver(self) -> str:
         return f"{self.cl_device.platform.version} / {self.cl_device.driver_version}".strip()
 

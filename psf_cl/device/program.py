@@ -30,9 +30,6 @@ _SCALARS: dict[str, type[np.generic]] = {
 _WARM_UP_BYTES = 4096
 _BUILD_OPTIONS = ("-cl-std=CL1.2", "-cl-kernel-arg-info")
 
-#: Bytes of constants that all tables fit into; OpenCL 1.2 promises 64 KiB.
-FEW_CONSTANTS = 96 << 10
-
 
 def assemble(file: str, folder: Path | None = None) -> str:
     """Return the text of ``file`` with every ``#include "x"`` expanded once.
@@ -169,15 +166,12 @@ def load_program(
 ) -> Program:
     """Return ``file`` built with ``defines``; a device builds each combination once.
 
-    The lane width and the block of the pool are defined for every program, and FEW_CONSTANTS where
-    the device has little room for constants.
+    The lane width and the block of the pool are defined for every program.
     """
     traits = device.traits
     values = {"W": traits.lanes, "BLOCK": traits.block, "RUN": traits.run} | {
         name: int(value) for name, value in (defines or {}).items()
     }
-    if device.largest_constants < FEW_CONSTANTS:
-        values["FEW_CONSTANTS"] = 1
     key = (file, folder, tuple(sorted(values.items())))
     if key not in device.programs:
         device.programs[key] = Program(device, file, values, folder)
