@@ -6,6 +6,10 @@
 // at last pixel by pixel.  With ever more samples all of it goes back: the picture becomes that of plain
 // path tracing.
 //
+// Where a rare bright sample is missing all looks darker than its cell, and sure: without care its light
+// would be taken from there, and not be given to where it is, for there is noise.  So the noise around counts
+// too, and nothing becomes negative.
+//
 // James, Stein: Estimation with Quadratic Loss, 1961 (shrinking by the part that is noise).
 
 #include "common/lanes.h"
@@ -22,6 +26,12 @@ static inline Float sure_part(Float square, Float noise)
 {
     return max(square - noise, (Float)(0.0f)) / max(square, (Float)(1e-37f));
 }
+
+// Of the mean noise of the first window, the part that is the least of each pixel.
+#define LEAST_NOISE 0.125f
+
+/// `back`, but no more of it than leaves a pixel that is not negative so.
+static inline float kept_positive(float back, float restored) { return max(back, -max(restored, 0.0f)); }
 
 /// Column and row of W pixels in the crop.
 static inline void place_in_crop(__global const Params *params, UInt pixel, UInt *column, UInt *row)
@@ -119,8 +129,8 @@ kernel void sum_rows(
         vstore4((float4)(lane[0][k], lane[1][k], lane[2][k], lane[3][k]), first + k, (__global float *)rows);
 }
 
-/// Add back what stands out in windows of the picture, `radius` pixels to each side.  One work item W
-/// pixels, after sum_rows.
+/// Add back what stands out in windows of the picture, `radius` pixels to each side, and if they are the first
+/// ones lift the noise of each pixel.  One work item W pixels, after sum_rows.
 ///
 /// reads   rows
 /// writes  unrestored, restored
@@ -129,7 +139,8 @@ kernel void restore_windows(
     __global const Lost *rows,
     __global Lost *unrestored,
     __global float *restored,
-    const uint radius)
+    const uint radius,
+    const uint is_first)
 {
     const uint first = get_global_id(0) * W;
     if (first >= params->pixel_count)
@@ -147,15 +158,22 @@ kernel void restore_windows(
     const Vec3 mean = scale(sum, inverse);
     const Float y = luminance(mean);
     const Vec3 back = scale(mean, sure_part(y * y, variance * inverse * inverse));
-    float lane[3][W];
+    float lane[4][W];
     store_lanes(back.x, lane[0]);
     store_lanes(back.y, lane[1]);
     store_lanes(back.z, lane[2]);
-    for (uint k = 0; k < min((uint)W, params->pixel_count - first); ++k)
+    store_lanes(variance * inverse * LEAST_NOISE, lane[3]);
+    for (uint k = 0; k < min((uint)W, params->pixel_count - first); ++k) {
+        __global Lost *left = &unrestored[first + k];
         for (uint c = 0; c < 3; ++c) {
-            unrestored[first + k].rgb[c] -= lane[c][k];
-            restored[4 * (first + k) + c] += lane[c][k];
+            __global float *value = &restored[4 * (first + k) + c];
+            const float moved = kept_positive(lane[c][k], *value);
+            left->rgb[c] -= moved;
+            *value += moved;
         }
+        if (is_first)
+            left->difference = max(left->difference, lane[3][k]);
+    }
 }
 
 /// Add back what stands out in a pixel, judged by it and its neighbours.  One work item W pixels.
@@ -188,6 +206,8 @@ kernel void restore_pixels(__global const Params *params, __global const Lost *u
     store_lanes(back.y, lane[1]);
     store_lanes(back.z, lane[2]);
     for (uint k = 0; k < min((uint)W, params->pixel_count - first); ++k)
-        for (uint c = 0; c < 3; ++c)
-            restored[4 * (first + k) + c] += lane[c][k];
+        for (uint c = 0; c < 3; ++c) {
+            __global float *value = &restored[4 * (first + k) + c];
+            *value += kept_positive(lane[c][k], *value);
+        }
 }

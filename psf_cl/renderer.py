@@ -1158,7 +1158,12 @@ class Renderer:
         for radius in restore.RADII:
             add_up = program.bind("sum_rows", rows=rows, radius=radius, **state)
             add = program.bind(
-                "restore_windows", rows=rows, restored=restored, radius=radius, **state
+                "restore_windows",
+                rows=rows,
+                restored=restored,
+                radius=radius,
+                is_first=int(radius == restore.RADII[0]),
+                **state,
             )
             self.restore_launches[radius] = [(add_up, items), (add, items)]
         last = program.bind("restore_pixels", restored=restored, **state)

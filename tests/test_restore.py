@@ -30,7 +30,7 @@ def windows(image, radius):
     return sums, counts
 
 
-def model(opened):
+def model(opened, positive=True):
     """Return the picture that the film and what it lost make."""
     width, height = SIZE
     film, lost = (opened.device.read(opened.buffers[name]) for name in ("film", "film_lost"))
@@ -53,19 +53,27 @@ def model(opened):
     left, variance = picture(mean), picture(difference**2 / (1 - first**2) * (1 + 4 / (count - 1)))
     # Two variances are noise at first, and ever less of them after 32 passes.
     cautious = 1 + min(1, 32 / len(passes))
+
+    def put_back(image, left, back):
+        if positive:
+            back = np.maximum(back, -np.maximum(image, 0))
+        return image + back, left - back
+
     for radius in (8, 2) if len(passes) < 16 else (8, 4, 2, 1):
         sums, counts = windows(np.concatenate([left, variance], axis=-1), radius)
         means = sums[..., :3] / counts[..., None]
         square = (means @ LUMINANCE) ** 2
         noise = cautious * sums[..., 3] / counts**2
         back = (np.maximum(square - noise, 0) / np.maximum(square, 1e-37))[..., None] * means
-        left, image = left - back, image + back
+        image, left = put_back(image, left, back)
+        if radius == 8:
+            variance = np.maximum(variance, sums[..., 3:] / counts[..., None] / 8)
     # At the edges of the picture a neighbour that is missing is the pixel at the edge, once more.
     both = np.stack([(left @ LUMINANCE) ** 2, variance[..., 0]], axis=-1)
     padded = np.pad(both, [(1, 1), (1, 1), (0, 0)], mode="edge")
     near = sum(padded[y : y + height, x : x + width] for y in range(3) for x in range(3))
     part = np.maximum(near[..., 0] - cautious * near[..., 1], 0) / np.maximum(near[..., 0], 1e-37)
-    return image + part[..., None] * left
+    return put_back(image, left, part[..., None] * left)[0]
 
 
 def error(image, truth):
@@ -91,6 +99,20 @@ def test_the_picture_equals_a_model_in_numpy(lane_device, spp):
     averages = np.zeros((SIZE[0] * SIZE[1], 3))
     averages[opened.order] = film["sum"] / film["count"][:, None]
     assert error(expected, averages.reshape(image.shape)) > 1e-6
+    np.testing.assert_allclose(image, expected, rtol=1e-3, atol=1e-4)
+
+
+def test_no_pixel_is_made_negative(lane_device):
+    """As where a bright sample that others had is missing: a pixel has much less than its cell."""
+    opened = renderer(lane_device, room(SIZE), **RESTORE)
+    opened.render(spp=4)
+    lost = opened.device.read(opened.buffers["film_lost"])
+    lost["rgb"][: SIZE[0] * SIZE[1] // 3] -= 8.0
+    opened.device.write(opened.buffers["film_lost"], lost)
+    image, expected, unbounded = opened.image().rgb, model(opened), model(opened, positive=False)
+    opened.close()
+    assert unbounded.min() < -1.0
+    assert image.min() >= 0.0
     np.testing.assert_allclose(image, expected, rtol=1e-3, atol=1e-4)
 
 
