@@ -6,6 +6,7 @@
 #include "common/features.h"
 #include "common/lanes.h"
 #include "common/layout.h"
+#include "common/noise.h"
 #include "common/pixels.h"
 #include "common/probes.h"
 #include "common/history.h"
@@ -163,6 +164,9 @@ static inline Shared shared_by_cells(
 }
 #endif
 
+// Frames from which on their scatter tells the noise.
+#define LEAST_FRAMES 3.5f
+
 /// Blend the light of this frame with what is known from the frames before.  One work item W pixels.
 ///
 /// A pixel looks where its surface was, between four pixels, and takes those that saw the same: the same
@@ -280,10 +284,19 @@ kernel void blend_history(
         store_lanes(parts[c], lane_parts[c]);
 #endif
 
-    const Float values[10] = {mean.x,      mean.y,      mean.z, count,  base_mean.x,
-                              base_mean.y, base_mean.z, alpha,  square, change};
-    float lane[10][W];
-    for (uint c = 0; c < 10; ++c)
+    // Of the samples of one frame, or of the means of several.
+    Float noise = (Float)(NOISE_UNKNOWN);
+#if BASE
+    noise = pick(fresh > 1.0f, NOISE_OF_MEAN(GATHER(film_base, pixel, squares), max(fresh, 2.0f)), noise);
+#endif
+    const Float mean_luminance = luminance(mean);
+    noise = pick(count > LEAST_FRAMES * fresh,
+                 max(square - mean_luminance * mean_luminance, 0.0f) * fresh / max(count, 1.0f), noise);
+
+    const Float values[11] = {mean.x,      mean.y, mean.z, count,  base_mean.x, base_mean.y,
+                              base_mean.z, alpha,  square, change, noise};
+    float lane[11][W];
+    for (uint c = 0; c < 11; ++c)
         store_lanes(values[c], lane[c]);
     const uint lanes = min(params->pixel_count - first, (uint)W);
     for (uint k = 0; k < lanes; ++k) {
@@ -291,7 +304,7 @@ kernel void blend_history(
         vstore8((float8)(lane[0][k], lane[1][k], lane[2][k], lane[3][k], lane[4][k], lane[5][k], lane[6][k],
                          lane[7][k]),
                 0, words);
-        vstore4((float4)(lane[8][k], lane[9][k], 0.0f, 0.0f), 2, words);
+        vstore4((float4)(lane[8][k], lane[9][k], lane[10][k], 0.0f), 2, words);
 #if CELL_HISTORY
         __global float *its = (__global float *)(shared_pixels + first + k);
         vstore4((float4)(lane_parts[0][k], lane_parts[1][k], lane_parts[2][k], lane_parts[3][k]), 0, its);

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scene_builder import build, camera, floor, glowing, lambertian, render, renderer
+from scene_builder import LUMINANCE, build, camera, floor, glowing, lambertian, render, renderer
 
 from psf_cl.device import layout
 from psf_cl.device.device import open_device
@@ -17,6 +17,7 @@ from psf_cl.settings import Settings
 
 FILTER = {"screen_filter": "path_space"}
 SIZE = (24, 18)
+NOISE_UNKNOWN = next(value for name, value, _ in layout.FLOAT_CONSTANTS if name == "NOISE_UNKNOWN")
 
 
 def room(size=SIZE, matt=True):
@@ -76,6 +77,7 @@ def model(opened, light, seen):
     turned = unit(random)
     weight = light["count"][..., None].astype(np.float64)
     sums = [weight * light["base"], weight * seen["gate"]]
+    brightness, reflects = light["base"] @ LUMINANCE, seen["gate"] @ LUMINANCE
     shared = np.zeros((height, width), bool)
     for k in range(settings.screen_neighbours):
         random = mix_bits(random + np.uint32(0x9E3779B9))
@@ -92,6 +94,9 @@ def model(opened, light, seen):
         agrees &= np.abs((ns * between).sum(-1)) < footprint
         agrees &= np.abs((ns[at] * between).sum(-1)) < footprint
         agrees &= np.linalg.norm(between, axis=-1) < 2 * radius * footprint
+        apart = brightness * reflects[at] - brightness[at] * reflects
+        noise = light["noise"] * reflects[at] ** 2 + light["noise"][at] * reflects**2
+        agrees &= apart**2 <= 3 * noise
         for total, values in zip(sums, (light["base"], seen["gate"]), strict=True):
             total += np.where(agrees[..., None], weight[at] * values[at], 0.0)
         shared |= agrees
@@ -139,6 +144,7 @@ def surfaces(opened, heights):
     light["base"] = seen["gate"]
     light["rgb"] = seen["gate"] + 0.25
     light["count"] = 1
+    light["noise"] = NOISE_UNKNOWN
     return light, seen
 
 
@@ -164,6 +170,10 @@ def test_the_filter_equals_a_model_of_it(opened):
     light["base"] = seen["gate"] * rng.exponential(1.0, seen["gate"].shape)
     light["rgb"] = light["base"] + rng.random(seen["gate"].shape)
     light["count"] = rng.integers(1, 9, seen.shape)
+    known = rng.random(seen.shape) < 0.7
+    light["noise"][known] = (rng.exponential(0.5, seen.shape) * (seen["gate"] @ LUMINANCE) ** 2)[
+        known
+    ]
     expected, shared = model(opened, light, seen)
     found = filtered(opened, light, seen)
     assert 0.5 < shared.mean() < 1.0
@@ -191,6 +201,34 @@ def test_nothing_crosses_a_depth_edge(opened, step):
     light["base"] *= np.where(near, 1.0, 0.0)[None, :, None]
     light["rgb"] = light["base"]
     assert np.abs(filtered(opened, light, seen) - light["rgb"]).max() > 0.1
+
+
+def test_the_edge_of_a_shadow_stays_where_it_stands_out_of_the_noise(opened):
+    lit = np.arange(SIZE[0]) < SIZE[0] // 2
+    light, seen = surfaces(opened, np.zeros(SIZE[::-1]))
+    light["base"] *= np.where(lit, 1.0, 0.1)[None, :, None]
+    light["rgb"] = light["base"]
+    for deviation, moved in ((0.01, False), (2.0, True)):
+        light["noise"] = (deviation * (seen["gate"] @ LUMINANCE)) ** 2
+        found = filtered(opened, light, seen)
+        assert (np.abs(found - light["rgb"]).max() > 0.1) == moved
+
+
+def test_noise_is_that_of_the_mean_of_the_samples(device):
+    """Of independent samples: the scatter of renders that differ by their seeds."""
+    means, noises = [], []
+    for seed in range(24):
+        opened = renderer(device, room(), **FILTER, sampler="random", seed=seed)
+        opened.render(spp=8)
+        opened.image()
+        light = opened.device.read(opened.buffers["light"])
+        means.append(light["base"] @ LUMINANCE)
+        noises.append(light["noise"])
+        opened.close()
+    # Of 8 samples a variance counts 1 + 4 / 7 times.
+    np.testing.assert_allclose(
+        np.mean(noises) * 7 / 11, np.var(means, axis=0, ddof=1).mean(), rtol=0.1
+    )
 
 
 @pytest.mark.slow

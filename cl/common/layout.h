@@ -85,6 +85,7 @@
 #define LUMINANCE_BLUE 0.0722f
 #define TEXEL_STEPS 16777216.0f // fixed-point steps of sums of texels, which are from 0 to 1
 #define SAME_SURFACE_COSINE 0.9f // normals further apart are those of different surfaces
+#define NOISE_UNKNOWN 1e+30f // variance of light of which too little is known to tell it
 
 #define PATH_ORIGIN_X 0u // ray origin, world, m
 #define PATH_ORIGIN_Y 1u
@@ -809,7 +810,8 @@ typedef struct {
     float alpha; // weight that this frame has in it
     float square; // mean of the squared luminance of frames
     float change; // of the light since the frame before, 0 to 1
-    float pad[2]; // fills the record
+    float noise; // variance of the luminance of `base`, NOISE_UNKNOWN where nothing can be told
+    float pad; // fills the record
 } PixelLight;
 
 /// A pixel of the frame before: its light and what it sees.

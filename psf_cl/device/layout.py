@@ -520,7 +520,8 @@ PIXEL_LIGHT = Record(
     float alpha - weight that this frame has in it
     float square - mean of the squared luminance of frames
     float change - of the light since the frame before, 0 to 1
-    float pad[2] - fills the record
+    float noise - variance of the luminance of `base`, NOISE_UNKNOWN where nothing can be told
+    float pad - fills the record
     """),
 )
 
@@ -1049,6 +1050,7 @@ FLOAT_CONSTANTS = (
     ("LUMINANCE_BLUE", LUMINANCE[2], ""),
     ("TEXEL_STEPS", 2.0**24, "fixed-point steps of sums of texels, which are from 0 to 1"),
     ("SAME_SURFACE_COSINE", 0.9, "normals further apart are those of different surfaces"),
+    ("NOISE_UNKNOWN", 1e30, "variance of light of which too little is known to tell it"),
 )
 CONSTANTS = (
     ("LEAF_BIT", 0x80000000, "child[] is a block of triangles"),
