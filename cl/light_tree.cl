@@ -76,14 +76,13 @@ kernel void fit_light_pairs(
     const uint pair = order[level_start + i];
     LightBounds side[2];
     for (uint k = 0; k < 2; ++k) {
-        uint child = pairs[pair].child[k];
+        const uint child = pairs[pair].child[k];
         if (child == NO_LIGHT) {
             side[k] = side[0];
             side[k].power = 0.0f;
         } else {
-            child &= ~GROUP_BIT;
-            side[k] =
-                child >= LEAF_BIT ? bounds_of_light(&lights[child & ~LEAF_BIT], power_unit) : bounds[child];
+            const uint index = child & NODE_MASK;
+            side[k] = child >= LEAF_BIT ? bounds_of_light(&lights[index], power_unit) : bounds[index];
         }
     }
     const int split = side[0].far != side[1].far;

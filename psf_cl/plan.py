@@ -1058,6 +1058,12 @@ def _scene_buffers(context: Context, scene: Scene) -> tuple[BufferSpec, ...]:
             BufferSpec("light_order", uint32, lights, "levels of the tree"),
             BufferSpec("light_places", uint32, 2 * lights, "where each light is in the tree"),
             BufferSpec(
+                "light_clusters",
+                uint32,
+                layout.CONSTANT["CLUSTER_PARTS"] * lights,
+                "small subtrees, from which a point far away draws by power",
+            ),
+            BufferSpec(
                 "light_groups",
                 layout.LIGHT_GROUP.dtype,
                 lights,

@@ -16,7 +16,7 @@ from scene_builder import (
 )
 from scipy import stats
 
-from psf_cl.device import layout
+from psf_cl.device import layout, light_tree
 from psf_cl.device.layout import CONSTANT
 from psf_cl.device.light_tree import LightTree
 from psf_cl.plan import make_plan
@@ -53,7 +53,8 @@ class Planted:
         self.device, self.count = device, len(table)
         self.lights = device.upload("lights", table)
         self.tree = LightTree(device, table, self.lights, NEAR_SHARE, radius)
-        self.given = {name: self.tree.buffers[name] for name in ("light_pairs", "light_places")}
+        names = ("light_pairs", "light_places", "light_clusters")
+        self.given = {name: self.tree.buffers[name] for name in names}
 
     def draw(self, points, bits):
         inputs = {"points": points, "bits": bits}
@@ -206,6 +207,55 @@ def test_light_that_is_not_finite_is_never_drawn(plant):
     chances = plant(table).chances(random_points(50))
     assert np.all(chances[:, 4] == 0.0)
     np.testing.assert_allclose(chances.sum(axis=1), 1.0, atol=2e-5)
+
+
+@pytest.fixture
+def bunches(plant, monkeypatch):
+    """Return a tree of eight bunches of tiny lights that are clusters, their table and bunches."""
+    monkeypatch.setattr(light_tree, "MOST_IN_CLUSTER", 12)
+    monkeypatch.setattr(light_tree, "FEWEST_CLUSTERED", 2)
+    table = random_table(80, seed=11, kinds=("TRIANGLE",))
+    bunch = np.arange(80) % 8
+    table["flags"] = 0
+    table["e1"], table["e2"] = [0.01, 0, 0], [0, 0, 0.01]
+    table["direction"] = [0, -1, 0]
+    table["position"] *= 0.01
+    table["position"] += 3.0 * np.array([[1, 1, 1], [-1, 1, 1], [1, 1, -1], [-1, 1, -1]])[bunch % 4]
+    table["position"][bunch >= 4, 1] += 9.0
+    table["power"][3] = 0.0
+    table["power"][11] = 1e9
+    return plant(table), table, bunch
+
+
+def test_clusters_that_are_far_away_draw_by_power(bunches):
+    planted, table, bunch = bunches
+    chances = planted.chances(np.array([[0.3, -1.0, 0.2, 0, 1, 0]], np.float32).T)[0]
+    for k in range(8):
+        power = np.where(bunch == k, table["power"], 0.0).astype(np.float64)
+        # All that shine have a 64th of the cluster alike.
+        shines = power > 0
+        truth = 63 / 64 * power / power.sum() + shines / shines.sum() / 64
+        own = chances[bunch == k]
+        np.testing.assert_allclose(own / own.sum(), truth[bunch == k], rtol=1e-4, atol=1e-7)
+    assert chances.sum() == pytest.approx(1.0, abs=2e-5)
+
+
+def test_clusters_draw_lights_as_often_as_their_chances_say_near_and_far(bunches):
+    planted, _, _ = bunches
+    rng = np.random.default_rng(5)
+    draws = 1 << 18
+    bits = rng.integers(0, 1 << 32, draws, dtype=np.uint32)
+    for place in ([0.3, -1.0, 0.2], [3.0, 2.95, 3.0]):
+        point = np.array([[*place, 0, 1, 0]], np.float32).T
+        truth = planted.chances(point)[0]
+        drawn, pmf, chance = planted.draw(np.repeat(point, draws, axis=1), bits)
+        np.testing.assert_allclose(pmf, truth[drawn], rtol=2e-5)
+        np.testing.assert_allclose(chance, pmf, rtol=2e-5)
+        often = truth * draws > 20
+        seen = np.bincount(drawn, minlength=80)[often]
+        expected = truth[often] * (seen.sum() / truth[often].sum())
+        assert often.sum() >= 8
+        assert stats.chisquare(seen, expected).pvalue > 1e-4
 
 
 def many_kinds():

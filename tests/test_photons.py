@@ -296,7 +296,8 @@ def test_chances_of_all_lights_sum_to_one_in_a_thousand_cells(device):
     normal /= np.linalg.norm(normal, axis=0)
     points = np.concatenate([rng.uniform(-2, 2, (3, 1000)), normal]).astype(np.float32)
     points[1, :700] = 1e-4  # On the floor, where photons are.
-    names = ("params", "lights", "light_pairs", "light_places", "light_groups", "particle_table")
+    tree = ("light_pairs", "light_places", "light_clusters", "light_groups")
+    names = ("params", "lights", *tree, "particle_table")
     given = {name: opened.buffers[name] for name in names}
     defines = {name: feature.value for name, feature in opened.plan.features.items()}
 
@@ -331,7 +332,8 @@ def test_what_a_lane_draws_does_not_hang_on_its_neighbours(device):
     lit = build(parts, camera((0, 1, 3), (0, 0, 0)), (4, 4))
     opened = open_renderer(device, lit, light_sampling="photon", photons=20000)
     opened.render(spp=1)
-    names = ("params", "lights", "light_pairs", "light_places", "light_groups", "particle_table")
+    tree = ("light_pairs", "light_places", "light_clusters", "light_groups")
+    names = ("params", "lights", *tree, "particle_table")
     given = {name: opened.buffers[name] for name in names}
     defines = {name: feature.value for name, feature in opened.plan.features.items()}
     rng = np.random.default_rng(12)

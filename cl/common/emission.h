@@ -49,7 +49,7 @@ LARGE_FUNCTION Emission emit(
     UInt light_bits;
     sample_bits(seed, reversed_index, pair + PAIR_CHOICE, params->sampler, &side_bits, &light_bits);
     Float alias_u;
-    const UInt slot = alias_slot(light_bits, params->light_count, &alias_u);
+    const UInt slot = alias_slot(light_bits, (UInt)(params->light_count), &alias_u);
     const UInt light = pick_u(alias_u < GATHER(lights, slot, keep), slot, GATHER_U(lights, slot, other));
     const UInt kind = GATHER_U(lights, light, kind);
     const Float weight = 1.0f / max(GATHER(lights, light, pmf), 1e-30f);

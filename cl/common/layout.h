@@ -3,6 +3,16 @@
 
 #define LEAF_BIT 0x80000000u // child[] is a block of triangles
 #define GROUP_BIT 0x40000000u // child[] of a LightPair is a group of lights for photons
+#define CLUSTER_BIT 0x20000000u // child[] of a LightPair is a cluster of lights
+#define NODE_MASK 0x1FFFFFFFu // what child[] of a LightPair says beside these and LEAF_BIT
+#define CLUSTER_LIGHT 0u // of light_clusters, by slot: the light that it keeps
+#define CLUSTER_KEEP 1u // by slot: chance that it keeps it, float
+#define CLUSTER_OTHER 2u // by slot: the light otherwise
+#define CLUSTER_CHANCE 3u // by light: that its cluster draws it, float
+#define CLUSTER_PLACE 4u // by light: 2 * pair + side of its cluster; NO_LIGHT for none
+#define CLUSTER_FIRST 5u // by pair that is a cluster: its first slot
+#define CLUSTER_LENGTH 6u // by pair: how many slots it has; 0 for none
+#define CLUSTER_PARTS 7u // each as long as there are lights
 #define ALPHA_BIT 0x80000000u // id[] needs its alpha looked up
 #define PLATE_TURN 28u // bit of the number of a corner
 #define NO_HIT 0xFFFFFFFFu
@@ -732,7 +742,7 @@ typedef struct {
     float power[2]; // of all its lights, as Light.power, in any one unit
     float cos_spread[2]; // of the angle between the axis and any direction that a light faces
     uint axis[2]; // mean direction that the lights face, octahedral, 16 bits a coordinate
-    uint child[2]; // index of a pair, or LEAF_BIT | index of a light, and GROUP_BIT; or NO_LIGHT
+    uint child[2]; // index of a pair, or LEAF_BIT | a light, GROUP_BIT, CLUSTER_BIT; or NO_LIGHT
 } LightPair;
 
 /// The subtree of lights around a light that photons do not tell apart.

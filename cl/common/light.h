@@ -20,15 +20,6 @@ typedef struct {
     Mask extended;    // whether a BSDF sample could find this light too
 } LightSample;
 
-/// Slot of an alias table for 32 random bits; what is left of them is uniform in the slot.
-///
-/// Vose: A Linear Algorithm for Generating Random Numbers with a Given Distribution, 1991.
-static inline UInt alias_slot(UInt bits, uint count, Float *left)
-{
-    *left = unit_float(bits * count);
-    return mul_hi(bits, (UInt)(count));
-}
-
 /// The two numbers in [0, 1), 16 bits each, that a photon's point of its light was drawn with.
 static inline void light_point(UInt point, Float *u1, Float *u2)
 {
@@ -151,7 +142,7 @@ LARGE_FUNCTION Vec3 sample_environment(
     const uint width = params->environment_width;
     const uint height = params->environment_height;
     Float unused;
-    UInt cell = alias_slot(index_bits, width * height, &unused);
+    UInt cell = alias_slot(index_bits, (UInt)(width * height), &unused);
     cell = pick_u(unit_float(alias_bits) < GATHER(cells, cell, keep), cell, GATHER_U(cells, cell, other));
     // float division of indices below 2^24 is exact enough to floor: the remainder is corrected.
     UInt row = to_uint(to_float(cell) / (float)width);
@@ -237,8 +228,9 @@ static inline Float sphere_density(
 
 // What choosing a light takes beside the table.
 #if LIGHT_SAMPLING
-#define TREE_PARAMETERS , __global const LightPair *light_pairs, __global const uint *light_places
-#define TREE_ARGUMENTS , light_pairs, light_places
+#define TREE_PARAMETERS \
+    , __global const LightPair *light_pairs, __global const uint *light_places, __global const uint *light_clusters
+#define TREE_ARGUMENTS , light_pairs, light_places, light_clusters
 #else
 #define TREE_PARAMETERS
 #define TREE_ARGUMENTS
@@ -267,7 +259,7 @@ static inline LightChoice choose_in_table(__global const Light *lights, uint lig
 {
     LightChoice choice;
     Float alias_u;
-    const UInt slot = alias_slot(bits, light_count, &alias_u);
+    const UInt slot = alias_slot(bits, (UInt)(light_count), &alias_u);
     choice.light = pick_u(alias_u < GATHER(lights, slot, keep), slot, GATHER_U(lights, slot, other));
     choice.pmf = GATHER(lights, choice.light, pmf);
     return choice;
@@ -314,9 +306,10 @@ static inline LightChoice choose_light(
     bits = pick_u(blind, mix_bits(bits), digits_left(u, part * (1.0f - kept), bits));
     const Mask there = active & (group != NO_LIGHT);
     const UInt pair = pick_u(there, group >> 1, (UInt)(0u));
-    const UInt node = pick_u((group & 1u) == 0u, GATHER_U(light_pairs, pair, child[0]),
-                             GATHER_U(light_pairs, pair, child[1]));
-    const TreeChoice drawn = descend_tree(light_pairs, count, there, node, q.p, q.n, bits);
+    const UInt child = pick_u((group & 1u) == 0u, GATHER_U(light_pairs, pair, child[0]),
+                              GATHER_U(light_pairs, pair, child[1]));
+    const TreeChoice drawn =
+        descend_tree(light_pairs, light_clusters, count, there, group, child, q.p, q.n, bits);
     LightChoice choice;
     choice.light = pick_u(there, drawn.light, (UInt)(0u));
     const Float chance = group_chance(particle_table, light_groups, there, q.row, choice.light);
@@ -327,7 +320,8 @@ static inline LightChoice choose_light(
 #endif
     return choice;
 #elif LIGHT_SAMPLING
-    const TreeChoice drawn = descend_tree(light_pairs, count, active, (UInt)(0u), q.p, q.n, bits);
+    const TreeChoice drawn = descend_tree(
+        light_pairs, light_clusters, count, active, (UInt)(0u), (UInt)(0u), q.p, q.n, bits);
     LightChoice choice;
     choice.light = drawn.light;
     choice.pmf = pick(active, drawn.above * drawn.inside, (Float)(0.0f));
@@ -347,9 +341,8 @@ static inline Float light_chance(
 {
 #if LIGHT_SAMPLING
     const UInt wanted = pick_u(active, light, (UInt)(0u));
-    const UInt place = GATHER_WORD(light_places, wanted);
-    const TreeChoice drawn = climb_tree(light_pairs, light_places, params->light_count,
-                                        LIGHT_PHOTONS ? (Mask)(0) : MASK_ALL, active, place, q.p, q.n);
+    const TreeChoice drawn = climb_tree(light_pairs, light_places, light_clusters, params->light_count,
+                                        LIGHT_PHOTONS ? (Mask)(0) : MASK_ALL, active, wanted, q.p, q.n);
 #if LIGHT_PHOTONS
     return drawn.inside * group_chance(particle_table, light_groups, active, q.row, wanted);
 #else

@@ -23,6 +23,10 @@ typedef struct {
 #define LEAST_LIGHT_SHARE 0x1p-10f
 // Sine of an angle beyond the horizon that still counts: normals and axes are rounded.
 #define HORIZON_SLACK 1e-3f
+// Of a cluster that is small, by its radius over the distance, and whose lights face one way, by the least cosine
+// to their axis, what each light brings is as its power.
+#define FAR_RATIO 0x1p-3f
+#define ONE_WAY 0.995f
 
 #if LIGHT_SAMPLING
 /// Cosine of the angle a - b, of at least 0, and its sine.
@@ -44,6 +48,13 @@ static inline Float node_word(__global const LightPair *pairs, UInt node, uint w
     return gather_words((__global const float *)pairs, at);
 }
 
+/// Center of a node, world, m.
+static inline Vec3 node_center(__global const LightPair *pairs, UInt node)
+{
+    const uint at = WORDS_BEFORE(center);
+    return vec3(node_word(pairs, node, at, 3u), node_word(pairs, node, at + 1u, 3u), node_word(pairs, node, at + 2u, 3u));
+}
+
 /// Power of all lights of a node.
 static inline Float node_power(__global const LightPair *pairs, UInt node)
 {
@@ -55,15 +66,12 @@ static inline Float rough_root(Float x) { return x * rough_rsqrt(max(x, 1e-30f))
 /// Bound of the light that a node of this power brings to a surface at `p` with normal `n`, unoccluded.
 static inline Float node_importance(__global const LightPair *pairs, UInt node, Float power, Vec3 p, Vec3 n)
 {
-    const uint at = WORDS_BEFORE(center);
     const Float radius = node_word(pairs, node, WORDS_BEFORE(radius), 1u);
-    const Vec3 center = vec3(node_word(pairs, node, at, 3u), node_word(pairs, node, at + 1u, 3u),
-                             node_word(pairs, node, at + 2u, 3u));
     const Vec3 axis = unpack_direction(as_bits(node_word(pairs, node, WORDS_BEFORE(axis), 1u)));
     const Float cos_spread = node_word(pairs, node, WORDS_BEFORE(cos_spread), 1u);
     const Float sin_spread = rough_root(1.0f - cos_spread * cos_spread);
 
-    const Vec3 toward = sub(center, p);
+    const Vec3 toward = sub(node_center(pairs, node), p);
     const Float d2 = dot3(toward, toward);
     const Float r2 = radius * radius;
     // From inside of the sphere as from its surface.
@@ -111,6 +119,22 @@ LARGE_FUNCTION Float left_chance(__global const LightPair *pairs, UInt pair, Vec
     return pick(both, clamp(chance, (Float)(LEAST_LIGHT_SHARE), (Float)(1.0f - LEAST_LIGHT_SHARE)), one);
 }
 
+/// Word `i` of a part of the clusters: of a light, of a slot of the clusters in order, or of a pair.
+static inline UInt cluster_word(__global const uint *clusters, uint light_count, uint part, UInt i)
+{
+    return GATHER_WORD(clusters, part * light_count + i);
+}
+
+/// Return where the power alone decides in a cluster, which is a node.
+static inline Mask is_far(__global const LightPair *pairs, Mask asks, UInt node, Vec3 p)
+{
+    node = pick_u(asks, node, (UInt)(0u));
+    const Vec3 toward = sub(node_center(pairs, node), p);
+    const Float radius = node_word(pairs, node, WORDS_BEFORE(radius), 1u);
+    const Float reach = FAR_RATIO * FAR_RATIO * dot3(toward, toward);
+    return asks & (radius * radius <= reach) & (node_word(pairs, node, WORDS_BEFORE(cos_spread), 1u) >= ONE_WAY);
+}
+
 /// A light of the tree, and the chances of the two parts of the way to it.
 typedef struct {
     UInt light;
@@ -118,22 +142,51 @@ typedef struct {
     Float inside; // that the light is drawn from its group
 } TreeChoice;
 
-/// Draw a light for a surface at `p` with normal `n`, from the nodes `child` of pairs on.
+/// Draw a light for a surface at `p` with normal `n`, below `node`, which has the word `child` in its pair.
 ///
 /// The random number goes from node to node: what is left of it is uniform in the node that was drawn.
 /// Digits that it runs out of are made up.
 LARGE_FUNCTION TreeChoice descend_tree(
-    __global const LightPair *pairs, uint light_count, Mask active, UInt child, Vec3 p, Vec3 n, UInt bits)
+    __global const LightPair *pairs,
+    __global const uint *clusters,
+    uint light_count,
+    Mask active,
+    UInt node,
+    UInt child,
+    Vec3 p,
+    Vec3 n,
+    UInt bits)
 {
     TreeChoice choice;
-    choice.light = child & ~LEAF_BIT & ~GROUP_BIT;
+    choice.light = child & NODE_MASK;
     choice.above = (Float)(1.0f);
     choice.inside = (Float)(1.0f);
     Float u = unit_float(bits);
     Mask inner = active & (child < LEAF_BIT);
-    UInt pair = pick_u(inner, choice.light, (UInt)(0u));
     // No tree is deeper than it has leaves.
     for (uint level = 0; level <= light_count && any_lane(inner); ++level) {
+        const UInt pair = pick_u(inner, child & NODE_MASK, (UInt)(0u));
+        const Mask small = inner & ((child & CLUSTER_BIT) != 0u);
+        if (any_lane(small)) {
+            const Mask far = is_far(pairs, small, node, p);
+            const UInt first = cluster_word(clusters, light_count, CLUSTER_FIRST, pair);
+            const UInt length =
+                pick_u(far, cluster_word(clusters, light_count, CLUSTER_LENGTH, pair), (UInt)(0u));
+            const Mask drawn = length > 0u;
+            Float alias_u;
+            const UInt digits = digits_left(u, (Float)(1.0f), mix_bits(bits + 0x9e3779b9u));
+            const UInt slot = alias_slot(digits, length, &alias_u) + pick_u(drawn, first, (UInt)(0u));
+            const Mask keeps = alias_u < from_bits(cluster_word(clusters, light_count, CLUSTER_KEEP, slot));
+            const UInt light = pick_u(keeps, cluster_word(clusters, light_count, CLUSTER_LIGHT, slot),
+                                      cluster_word(clusters, light_count, CLUSTER_OTHER, slot));
+            choice.light = pick_u(drawn, light, choice.light);
+            const UInt known = pick_u(drawn, light, (UInt)(0u));
+            const Float share = from_bits(cluster_word(clusters, light_count, CLUSTER_CHANCE, known));
+            choice.inside = pick(drawn, choice.inside * share, choice.inside);
+            inner &= !drawn;
+            if (!any_lane(inner))
+                break;
+        }
         const Float chance = left_chance(pairs, pair, p, n);
         const Mask left = u < chance;
         const Float share = pick(left, chance, 1.0f - chance);
@@ -141,6 +194,7 @@ LARGE_FUNCTION TreeChoice descend_tree(
         bits = mix_bits(bits + 0x9e3779b9u);
         const Float rest = (pick(left, u, u - chance) + 0x1p-24f * unit_float(bits)) * scale;
         u = clamp(rest, (Float)(0.0f), (Float)(0x1.fffffep-1f));
+        node = pair << 1 | pick_u(left, (UInt)(0u), (UInt)(1u));
         child = pick_u(left, GATHER_U(pairs, pair, child[0]), GATHER_U(pairs, pair, child[1]));
         // Where no light was fit for the tree, its only pair leads nowhere.
         const Mask there = child != NO_LIGHT;
@@ -148,34 +202,42 @@ LARGE_FUNCTION TreeChoice descend_tree(
         const Mask group = inner & ((child & GROUP_BIT) != 0u);
         choice.above = pick(group, so_far, choice.above);
         choice.inside = pick(group, (Float)(1.0f), pick(inner, so_far, choice.inside));
-        child &= ~GROUP_BIT;
         const Mask leaf = child >= LEAF_BIT;
-        choice.light = pick_u(inner & leaf & there, child & ~LEAF_BIT, choice.light);
+        choice.light = pick_u(inner & leaf & there, child & NODE_MASK, choice.light);
         inner &= !leaf;
-        pair = pick_u(inner, child, (UInt)(0u));
     }
     return choice;
 }
 
-/// Chances of the node at `place`, as 2 * pair + side, from its group and from the root.
+/// Chances of a light from its group and from the root.
 ///
-/// `places`: that of every light, then of every pair; NO_LIGHT for those that have none, which are never
-/// drawn.  Where `whole` is not set, only what is inside of the group matters.
+/// `places`: that of every light, as 2 * pair + side, then of every pair; NO_LIGHT for those that have none,
+/// which are never drawn.  Where `whole` is not set, only what is inside of the group matters.
 LARGE_FUNCTION TreeChoice climb_tree(
     __global const LightPair *pairs,
     __global const uint *places,
+    __global const uint *clusters,
     uint light_count,
     Mask whole,
     Mask active,
-    UInt place,
+    UInt light,
     Vec3 p,
     Vec3 n)
 {
     TreeChoice choice;
+    UInt place = GATHER_WORD(places, light);
     Mask climbs = active & (place != NO_LIGHT);
-    choice.light = (UInt)(0u);
+    choice.light = light;
     choice.above = pick(climbs, (Float)(1.0f), (Float)(0.0f));
     choice.inside = choice.above;
+    const UInt cluster = cluster_word(clusters, light_count, CLUSTER_PLACE, light);
+    const Mask small = climbs & (cluster != NO_LIGHT);
+    if (any_lane(small)) {
+        const Mask far = is_far(pairs, small, cluster, p);
+        place = pick_u(far, cluster, place);
+        choice.inside =
+            pick(far, from_bits(cluster_word(clusters, light_count, CLUSTER_CHANCE, light)), choice.inside);
+    }
     Mask inside = climbs;
     for (uint level = 0; level <= light_count; ++level) {
         const UInt pair = pick_u(climbs, place >> 1, (UInt)(0u));

@@ -299,14 +299,6 @@ static inline UInt node_point(__global const uint *table, Mask active, UInt row,
 }
 #endif
 
-/// 32 uniform bits of `u`, which is what is left of a number of 24 bits after a choice of chance `part`: it has
-/// only so many values, and the digits between them come from `more`.
-static inline UInt digits_left(Float u, Float part, UInt more)
-{
-    const Float whole = u + unit_float(more) * 0x1p-24f / max(part, 0x1p-24f);
-    return to_uint(clamp(whole, (Float)(0.0f), (Float)(0x1.fffffep-1f)) * 0x1p32f) ^ (more & 0xffu);
-}
-
 /// Draw a node of a row by `*u` in [0, 1), of which is left what is uniform in the node; `*part` is its chance,
 /// as node_chance says.
 static inline UInt choose_node(__global const uint *table, Mask active, UInt row, Float *u, Float *part)

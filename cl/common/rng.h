@@ -219,3 +219,20 @@ static inline void sample_pair(Seed seed, UInt reversed_index, UInt pair, uint s
     *first = unit_float(a);
     *second = unit_float(b);
 }
+
+/// Slot of an alias table for 32 random bits; what is left of them is uniform in the slot.
+///
+/// Vose: A Linear Algorithm for Generating Random Numbers with a Given Distribution, 1991.
+static inline UInt alias_slot(UInt bits, UInt count, Float *left)
+{
+    *left = unit_float(bits * count);
+    return mul_hi(bits, count);
+}
+
+/// 32 uniform bits of `u`, which is what is left of a number of 24 bits after a choice of chance `part`: it has
+/// only so many values, and the digits between them come from `more`.
+static inline UInt digits_left(Float u, Float part, UInt more)
+{
+    const Float whole = u + unit_float(more) * 0x1p-24f / max(part, 0x1p-24f);
+    return to_uint(clamp(whole, (Float)(0.0f), (Float)(0x1.fffffep-1f)) * 0x1p32f) ^ (more & 0xffu);
+}

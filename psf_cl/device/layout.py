@@ -418,7 +418,7 @@ LIGHT_PAIR = Record(
     float power[2] - of all its lights, as Light.power, in any one unit
     float cos_spread[2] - of the angle between the axis and any direction that a light faces
     uint axis[2] - mean direction that the lights face, octahedral, 16 bits a coordinate
-    uint child[2] - index of a pair, or LEAF_BIT | index of a light, and GROUP_BIT; or NO_LIGHT
+    uint child[2] - index of a pair, or LEAF_BIT | a light, GROUP_BIT, CLUSTER_BIT; or NO_LIGHT
     """),
 )
 
@@ -1055,6 +1055,16 @@ FLOAT_CONSTANTS = (
 CONSTANTS = (
     ("LEAF_BIT", 0x80000000, "child[] is a block of triangles"),
     ("GROUP_BIT", 0x40000000, "child[] of a LightPair is a group of lights for photons"),
+    ("CLUSTER_BIT", 0x20000000, "child[] of a LightPair is a cluster of lights"),
+    ("NODE_MASK", 0x1FFFFFFF, "what child[] of a LightPair says beside these and LEAF_BIT"),
+    ("CLUSTER_LIGHT", 0, "of light_clusters, by slot: the light that it keeps"),
+    ("CLUSTER_KEEP", 1, "by slot: chance that it keeps it, float"),
+    ("CLUSTER_OTHER", 2, "by slot: the light otherwise"),
+    ("CLUSTER_CHANCE", 3, "by light: that its cluster draws it, float"),
+    ("CLUSTER_PLACE", 4, "by light: 2 * pair + side of its cluster; NO_LIGHT for none"),
+    ("CLUSTER_FIRST", 5, "by pair that is a cluster: its first slot"),
+    ("CLUSTER_LENGTH", 6, "by pair: how many slots it has; 0 for none"),
+    ("CLUSTER_PARTS", 7, "each as long as there are lights"),
     ("ALPHA_BIT", 0x80000000, "id[] needs its alpha looked up"),
     ("PLATE_TURN", 28, "bit of the number of a corner"),
     ("NO_HIT", 0xFFFFFFFF, ""),

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from psf_cl.device.alias import alias_chances, alias_table
 from psf_cl.device.bvh import TreeBuild, warm_up_builder
 from psf_cl.device.device import Buffer, Device
 from psf_cl.device.layout import CONSTANT, LIGHT_BOUNDS, LIGHT_GROUP, LIGHT_PAIR
@@ -22,6 +23,14 @@ _GROUP = 64
 #: error of 4, 8, 16, 32, 128 and 512, with many photons too).
 LEAST_GROUPS = 16
 
+#: From far away clusters draw by power, with one look-up: subtrees of at most so many lights, if
+#: there are enough for groups to be larger (measured with 2^17: 1024 and 4096 are no faster).
+MOST_IN_CLUSTER = 256
+FEWEST_CLUSTERED = LEAST_GROUPS * MOST_IN_CLUSTER
+
+#: Part of its cluster that all lights of it have alike: the brightest may be hidden.
+LEVELLED = 2.0**-6
+
 
 @dataclass(frozen=True)
 class Topology:
@@ -34,12 +43,15 @@ class Topology:
         places: ``(lights + p,)`` uint32, 2 * pair + side of every light, then of every pair.
         groups: ``(lights,)`` uint32, the same of the group around each: the largest subtree of at
             most one part in LEAST_GROUPS of all lights.
+        clusters: ``(lights,)`` uint32, the same of the largest subtree of at most MOST_IN_CLUSTER
+            lights; NO_LIGHT where that is one light, and all of them if there are few lights.
     """
 
     links: np.ndarray
     levels: list[np.ndarray]
     places: np.ndarray
     groups: np.ndarray
+    clusters: np.ndarray
 
 
 class LightTree:
@@ -69,6 +81,9 @@ class LightTree:
         self.buffers = {
             "light_pairs": device.upload("light_pairs", pairs),
             "light_places": device.upload("light_places", topology.places),
+            "light_clusters": device.allocate(
+                "light_clusters", np.uint32, CONSTANT["CLUSTER_PARTS"] * len(table)
+            ),
             "light_groups": device.allocate("light_groups", LIGHT_GROUP.dtype, len(table)),
             "light_order": device.upload("light_order", np.concatenate(topology.levels)),
             "light_bounds": device.allocate("light_bounds", LIGHT_BOUNDS.dtype, len(pairs)),
@@ -90,7 +105,8 @@ class LightTree:
             level_start=0,
             level_count=0,
         )
-        self.groups = topology.groups
+        self.groups, self.clusters = topology.groups, topology.clusters
+        self.links = topology.links
         self.fit(table)
 
     def fit(self, table: np.ndarray) -> None:
@@ -101,6 +117,8 @@ class LightTree:
         groups = np.zeros(len(table), LIGHT_GROUP.dtype)
         groups["node"], groups["chance"] = self.groups, chances[index]
         self.device.write(self.buffers["light_groups"], groups)
+        clusters = _cluster_words(table["power"], self.clusters, self.links)
+        self.device.write(self.buffers["light_clusters"], clusters)
         for start, count in reversed(self.levels):
             self.launch.set(level_start=start, level_count=count)(count, group=_GROUP)
 
@@ -200,15 +218,62 @@ def _from_the_root(links: np.ndarray, light_count: int, most: int) -> Topology:
         below[level] = np.where(leaf[level], 1, 0)
         below[level] += np.where(inner, sizes[np.where(inner, links[level], 0)], 0)
         sizes[level] = below[level].sum(axis=1)
-    # The root is no node of a pair: its children are the largest groups that there can be.
-    whole = np.where(np.arange(pairs) == 0, most + 1, sizes)[:, None]
-    tops = (below > 0) & (below <= most) & (whole > most)
-    groups = np.full(light_count, _NONE, np.uint32)
-    around = np.full(pairs, _NONE, np.int64)
-    for level in levels:
-        of = np.where(tops[level], slots[level], around[level][:, None])
-        children, inner = links[level], links[level] < _LEAF
-        around[children[inner]] = of[inner]
-        groups[children[leaf[level]] & ~_LEAF] = of[leaf[level]]
-    links = np.where(tops, links | CONSTANT["GROUP_BIT"], links)
-    return Topology(links.astype(np.uint32), levels, places, groups)
+    # The root is no node of a pair: its children are the largest subtrees that there can be.
+    whole = np.where(np.arange(pairs) == 0, light_count + 1, sizes)[:, None]
+
+    def largest_of(most: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return which nodes are the largest subtrees of at most so many lights; each light's."""
+        tops = (below > 0) & (below <= most) & (whole > most)
+        own = np.full(light_count, _NONE, np.uint32)
+        around = np.full(pairs, _NONE, np.int64)
+        for level in levels:
+            of = np.where(tops[level], slots[level], around[level][:, None])
+            children, inner = links[level], links[level] < _LEAF
+            around[children[inner]] = of[inner]
+            own[children[leaf[level]] & ~_LEAF] = of[leaf[level]]
+        return tops, own
+
+    tops, groups = largest_of(most)
+    small, clusters = largest_of(MOST_IN_CLUSTER)
+    small &= ~leaf & (light_count >= FEWEST_CLUSTERED)
+    bits = np.where(tops, CONSTANT["GROUP_BIT"], 0) | np.where(small, CONSTANT["CLUSTER_BIT"], 0)
+    there = small.reshape(-1)[np.where(clusters == _NONE, 0, clusters)]
+    clusters = np.where(there, clusters, _NONE).astype(np.uint32)
+    return Topology((links | bits).astype(np.uint32), levels, places, groups, clusters)
+
+
+def _cluster_words(power: np.ndarray, clusters: np.ndarray, links: np.ndarray) -> np.ndarray:
+    """Return ``light_clusters``, by the parts that ``layout.CONSTANTS`` lists.
+
+    Args:
+        power: of each light, in any one unit.
+        clusters, links: as in ``Topology``.
+    """
+    count = len(power)
+    words = np.zeros((CONSTANT["CLUSTER_PARTS"], count), np.uint32)
+    words[CONSTANT["CLUSTER_PLACE"]] = _NONE
+    lights = np.flatnonzero(clusters != _NONE)
+    lights = lights[np.argsort(clusters[lights], kind="stable")]
+    if not len(lights):
+        return words.reshape(-1)
+    nodes, first, lengths = np.unique(clusters[lights], return_index=True, return_counts=True)
+    pairs = links.reshape(-1)[nodes] & CONSTANT["NODE_MASK"]
+    keep, chance = np.zeros((2, count), np.float32)
+    for node, pair, start, length in zip(nodes, pairs, first, lengths, strict=True):
+        own = lights[start : start + length]
+        weight = np.maximum(power[own].astype(np.float64), 0.0)
+        shines = weight > 0.0
+        if not shines.any():
+            continue
+        level = LEVELLED / (1.0 - LEVELLED) * weight.sum() / shines.sum()
+        slots = slice(start, start + length)
+        keep[slots], other = alias_table(weight + level * shines)
+        chance[own] = alias_chances(keep[slots], other)
+        words[CONSTANT["CLUSTER_LIGHT"], slots] = own
+        words[CONSTANT["CLUSTER_OTHER"], slots] = own[other]
+        words[CONSTANT["CLUSTER_PLACE"], own] = node
+        words[CONSTANT["CLUSTER_FIRST"], pair] = start
+        words[CONSTANT["CLUSTER_LENGTH"], pair] = length
+    words[CONSTANT["CLUSTER_KEEP"]] = keep.view(np.uint32)
+    words[CONSTANT["CLUSTER_CHANCE"]] = chance.view(np.uint32)
+    return words.reshape(-1)

@@ -67,7 +67,7 @@ kernel void list_densities(
 kernel void list_slots(global const uint *bits, global uint *slots, global float *left, const uint count)
 {
     Float rest;
-    STORE_U(slots, 0, alias_slot(LOAD_U(bits, 0), count, &rest));
+    STORE_U(slots, 0, alias_slot(LOAD_U(bits, 0), (UInt)(count), &rest));
     STORE(left, 0, rest);
 }
 

@@ -7,6 +7,7 @@
 kernel void draw_lights(
     global const LightPair *light_pairs,
     global const uint *light_places,
+    global const uint *light_clusters,
     const uint light_count,
     global const float *points,
     global const uint *bits,
@@ -16,11 +17,12 @@ kernel void draw_lights(
 {
     const Vec3 p = LOAD_V(points, 0);
     const Vec3 n = LOAD_V(points, 3);
-    const TreeChoice choice = descend_tree(light_pairs, light_count, MASK_ALL, (UInt)(0u), p, n, LOAD_U(bits, 0));
-    const TreeChoice back = climb_tree(light_pairs, light_places, light_count, MASK_ALL, MASK_ALL,
-                                       GATHER_WORD(light_places, choice.light), p, n);
-    const TreeChoice inside = climb_tree(light_pairs, light_places, light_count, (Mask)(0), MASK_ALL,
-                                         GATHER_WORD(light_places, choice.light), p, n);
+    const TreeChoice choice = descend_tree(
+        light_pairs, light_clusters, light_count, MASK_ALL, (UInt)(0u), (UInt)(0u), p, n, LOAD_U(bits, 0));
+    const TreeChoice back = climb_tree(light_pairs, light_places, light_clusters, light_count, MASK_ALL,
+                                       MASK_ALL, choice.light, p, n);
+    const TreeChoice inside = climb_tree(light_pairs, light_places, light_clusters, light_count, (Mask)(0),
+                                         MASK_ALL, choice.light, p, n);
     STORE_U(drawn, 0, choice.light);
     STORE(pmfs, 0, choice.above * choice.inside);
     STORE(chances, 0, back.above * inside.inside);
@@ -30,13 +32,13 @@ kernel void draw_lights(
 kernel void list_chances(
     global const LightPair *light_pairs,
     global const uint *light_places,
+    global const uint *light_clusters,
     const uint light_count,
     global const float *points,
     global const uint *light,
     global float *chances)
 {
-    const UInt place = GATHER_WORD(light_places, LOAD_U(light, 0));
-    const TreeChoice choice = climb_tree(light_pairs, light_places, light_count, MASK_ALL, MASK_ALL, place,
-                                         LOAD_V(points, 0), LOAD_V(points, 3));
+    const TreeChoice choice = climb_tree(light_pairs, light_places, light_clusters, light_count, MASK_ALL,
+                                         MASK_ALL, LOAD_U(light, 0), LOAD_V(points, 0), LOAD_V(points, 3));
     STORE(chances, 0, choice.above * choice.inside);
 }
