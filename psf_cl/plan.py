@@ -89,6 +89,9 @@ SPREAD_LIGHTS = 0.5
 MIN_SLOTS = 1 << 12
 MAX_HALVINGS = 6
 
+#: How often hash tables are halved where that does not do.
+TABLE_HALVINGS = 4
+
 
 @dataclass(frozen=True)
 class Room:
@@ -109,6 +112,7 @@ class Plan:
         scene_buffers: tables of the scene.
         crop: (x, y, width, height) of what is rendered.
         building: what building the tree needs for a while.
+        table_halvings: how often the hash tables were halved, for want of room.
         levels: how the scene is split into two levels, or None.
     """
 
@@ -122,6 +126,12 @@ class Plan:
     traits: DeviceTraits
     building: tuple[BufferSpec, ...] = ()
     levels: Levels | None = None
+    table_halvings: int = 0
+
+    @property
+    def cell_buckets(self) -> int:
+        """Return the buckets of the table of a pass."""
+        return cells.buckets(self.pixel_count, self.table_halvings)
 
     @property
     def pixel_count(self) -> int:
@@ -246,11 +256,12 @@ def make_plan(
         halves: whether half of the passes is to be summed apart, to estimate the error.
         room: bytes that there are; without it, as many as it takes.
         halvings: how often to halve the pool and what is in flight; where there is too little room
-            it is done once more.  It changes no bit of the image.
+            it is done once more.  It changes no bit of the image; but the hash tables, which are
+            halved from MAX_HALVINGS on, then share less light.
 
     Raises:
         InputError: an unknown AOV, a crop outside the film, or too many pixels.
-        DeviceError: there is not enough room, however small the pool.
+        DeviceError: there is not enough room, however small pool and tables.
     """
     traits = traits or DeviceTraits.of_kind("cpu")
     outputs = frozenset(outputs)
@@ -275,7 +286,8 @@ def make_plan(
         raise InputError(
             f"--size: {width}x{height} is more than {MAX_PIXELS} pixels; render parts with --crop"
         )
-    whole_traits, traits = traits, _smaller(traits, halvings)
+    table_halvings = max(halvings - MAX_HALVINGS, 0)
+    whole_traits, traits = traits, _smaller(traits, min(halvings, MAX_HALVINGS))
 
     check_together(settings)
     if halves and settings.splits > 1:
@@ -323,6 +335,7 @@ def make_plan(
         max_depth=settings.max_depth,
         moving=count_moving(scene),
         range_search=settings.path_filter == "range_search",
+        table_halvings=table_halvings,
         triangle_count=triangles,
         instance_count=0 if levels is None else levels.instance_count,
         corner_count=corners,
@@ -365,6 +378,9 @@ def make_plan(
     ]
     if len(shapes) < len(scene.shapes):
         left_out.append(("shapes", f"{len(scene.shapes) - len(shapes)} are cut out whole"))
+    if table_halvings:
+        part = f"1 of {1 << table_halvings}"
+        left_out.append(("slots", f"of large hash tables {part} is there: too little room"))
     plan = Plan(
         features,
         tuple(stages),
@@ -376,11 +392,12 @@ def make_plan(
         traits,
         () if context.on("FEW") else _building(context),
         levels,
+        table_halvings,
     )
     lacking = plan.lacks(room) if room is not None else None
     if lacking is None:
         return plan
-    if halvings == MAX_HALVINGS:
+    if halvings == MAX_HALVINGS + TABLE_HALVINGS:
         raise DeviceError(f"{lacking}; a smaller --size or --crop, or fewer --aov, need less")
     return make_plan(
         scene,

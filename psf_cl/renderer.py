@@ -224,7 +224,7 @@ class Renderer:
         if self.add_seen is not None:
             self.add_seen(self.film_items(1), film.GROUP)
         if self.clear_cells is not None:
-            self.clear_cells(cells.buckets(self.plan.pixel_count))
+            self.clear_cells(self.plan.cell_buckets)
         self.advance(1)
 
     def film_items(self, planes: int) -> int:
@@ -327,7 +327,7 @@ class Renderer:
             for launch, items in (*self.blend_launches, *self.history_launches):
                 launch(items, film.GROUP)
             if self.keep_cells is not None:
-                self.keep_cells(cells.buckets(self.plan.pixel_count), film.GROUP)
+                self.keep_cells(self.plan.cell_buckets, film.GROUP)
             for launch, items in self.probe_launches:
                 launch(items)
 
@@ -670,7 +670,7 @@ class Renderer:
             if start - self.guide_out >= guide.PASSES_WITHOUT:
                 self._guide(True, start)
         if self.guide_out is None:
-            slots = guide.slots_of(self.plan.pixel_count)
+            slots = self.buffers["guide_keys"].count
             if new_frame:
                 self.renew_guide(buckets_of(slots), film.GROUP)
             # What was learned from little fades, and what was true before something changed.
@@ -684,7 +684,7 @@ class Renderer:
 
     def _freeze_cache(self, start: int) -> None:
         """Let paths of the epoch of pass ``start`` end by what was gathered so far."""
-        slots = cache.slots_of(self.plan.pixel_count)
+        slots = self.buffers["cache_keys"].count
         new_frame = start == self.scheduler.first > 0
         if new_frame:
             self.renew_cache(buckets_of(slots), film.GROUP)
@@ -698,7 +698,7 @@ class Renderer:
             # Textures have moved.
             for name in material_cells.BUFFERS:
                 self.device.fill(self.buffers[name])
-        self.freeze_materials(material_cells.slots_of(self.plan.pixel_count), film.GROUP)
+        self.freeze_materials(self.buffers["material_keys"].count, film.GROUP)
 
     def _is_new(self, start: int) -> bool:
         """Return whether what is known at pass ``start`` was learned from little."""
@@ -899,15 +899,16 @@ class Renderer:
         values["first_moving"] = geometry.count - (moving.triangles if moving else 0)
         # There is no frame before the first: nothing has moved.
         values |= {new: values[name] for new, name in tables.PREVIOUS_CAMERA.items()}
-        values |= cells.parameters(scene, settings, self.plan.pixel_count)
+        pixels, halvings = self.plan.pixel_count, self.plan.table_halvings
+        values |= cells.parameters(scene, settings, pixels, halvings)
         values |= screen.parameters(settings)
-        values |= metropolis.parameters(settings, self.plan.traits.slots, self.plan.pixel_count)
+        values |= metropolis.parameters(settings, self.plan.traits.slots, pixels)
         values |= temporal.parameters(settings)
         values |= cell_history.parameters(settings, self.time)
-        values |= guide.parameters(scene, settings, self.plan.pixel_count, values["scene_radius"])
-        values |= cache.parameters(scene, settings, self.plan.pixel_count)
-        values |= material_cells.parameters(scene, settings, self.plan.pixel_count)
-        values |= photons.parameters(settings, len(lights))
+        values |= guide.parameters(scene, settings, pixels, values["scene_radius"], halvings)
+        values |= cache.parameters(scene, settings, pixels, halvings)
+        values |= material_cells.parameters(scene, settings, pixels, halvings)
+        values |= photons.parameters(settings, len(lights), halvings)
         for name, value in values.items():
             params[0][name] = value
         return params
@@ -1100,7 +1101,7 @@ class Renderer:
             return
         traits, pixels = self.plan.traits, self.plan.pixel_count
         per_pixel = -(-pixels // (traits.lanes * traits.run))
-        per_bucket = cells.buckets(pixels)
+        per_bucket = self.plan.cell_buckets
         stage = next(stage for stage in self.plan.stages if stage.name == "cells")
         order = (
             (program, "count_crowds", per_pixel),

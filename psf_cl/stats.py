@@ -32,6 +32,7 @@ def statistics_of(renderer: Renderer) -> dict[str, Any]:
         "device": renderer.device.name,
         "driver": renderer.device.driver,
         "peak_device_bytes": renderer.device.peak_bytes,
+        "table_halvings": renderer.plan.table_halvings,
         "stages": stages,
         "occupancy": _occupancy(renderer),
         "counters": {
@@ -125,7 +126,7 @@ def _cell_statistics(renderer: Renderer, counters: np.ndarray) -> dict[str, int 
 
     names = ("failed_inserts", "rejected_cells", "unfiltered_samples")
     used, passes = layout.whole(counters, "cells_used"), max(renderer.scheduler.passes, 1)
-    slots = cells.slots_of(renderer.plan.pixel_count)
+    slots = cells.slots_of(renderer.plan.pixel_count, renderer.plan.table_halvings)
     kept = {}
     if "kept_keys" in renderer.buffers:
         keys = renderer.device.read(renderer.buffers["kept_keys"])

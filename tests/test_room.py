@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import resource
 import subprocess
@@ -15,10 +16,12 @@ from scene_builder import build, camera, floor, glowing, renderer
 
 from psf_cl.cli.main import main
 from psf_cl.device.device import Device
+from psf_cl.device.hash_map import LEAST_SLOTS
 from psf_cl.errors import DeviceError, InputError
-from psf_cl.plan import MAX_HALVINGS, MAX_PIXELS, MIN_SLOTS, Room, make_plan
+from psf_cl.plan import MAX_HALVINGS, MAX_PIXELS, MIN_SLOTS, TABLE_HALVINGS, Room, make_plan
+from psf_cl.renderer import Renderer
 from psf_cl.scene import primitives, transform
-from psf_cl.scene.model import Material
+from psf_cl.scene.model import Light, Material
 from psf_cl.settings import Settings
 
 LIGHT = transform.translation((0, 2.5, 0)) @ transform.rotation_xyz_degrees((180, 0, 0))
@@ -51,9 +54,49 @@ def test_with_less_room_the_pool_is_smaller_and_nothing_else_changes():
     assert fitted.traits.slots < whole.traits.slots and fitted.ring <= whole.ring
     assert fitted.features == whole.features and fitted.scene_buffers == whole.scene_buffers
     least = make_plan(large, Settings(path_filter="hash_grid"), halvings=MAX_HALVINGS)
-    assert least.traits.slots == MIN_SLOTS
+    assert least.traits.slots == MIN_SLOTS and least.table_halvings == 0
+
+
+def two_lights(size, columns=12):
+    """Return the scene with another light, so that there is a choice."""
+    lamp = Light("point", (2.0, 2.0, 2.0), position=(-1.5, 1.0, 1.0))
+    return dataclasses.replace(scene(size, columns), lights=(lamp,))
+
+
+def test_where_a_small_pool_does_not_do_tables_are_smaller_too():
+    large = two_lights((256, 192))
+    many = Settings(path_filter="hash_grid", guiding="learned", termination="cache")
+    many = many.with_values({"light_sampling": "photon"})
+    least = make_plan(large, many, halvings=MAX_HALVINGS)
+    tables = {b.name: b.count for b in least.buffers if b.name.endswith("_keys")}
+    assert set(tables) == {"cell_keys", "guide_keys", "cache_keys", "particle_keys"}
+    fitted = make_plan(large, many, room=Room(least.peak_bytes - 1))
+    assert (
+        fitted.table_halvings == 1
+        and ("slots", "of large hash tables 1 of 2 is there: too little room") in fitted.left_out
+    )
+    assert {b.name: 2 * b.count for b in fitted.buffers if b.name in tables} == tables
+    floor = make_plan(large, many, halvings=MAX_HALVINGS + TABLE_HALVINGS)
+    assert min(b.count for b in floor.buffers if b.name in tables) >= LEAST_SLOTS
     with pytest.raises(DeviceError, match=r"needs \d+ MiB, the most of it for \w+ .* a smaller"):
-        make_plan(large, Settings(path_filter="hash_grid"), room=Room(least.peak_bytes - 1))
+        make_plan(large, many, room=Room(floor.peak_bytes - 1))
+
+
+def test_a_render_with_smaller_tables_shares_less_and_is_as_bright(device):
+    few = two_lights((96, 64), columns=6)
+    values = {"path_filter": "hash_grid", "guiding": "learned", "light_sampling": "photon"}
+    settings = Settings().with_values(values | {"cell_size": 1.0})
+    least = make_plan(few, settings, traits=device.traits, halvings=MAX_HALVINGS)
+    seen = []
+    for room in (None, Room(least.peak_bytes - 1)):
+        with contextlib.closing(Renderer(few, settings, device, room=room)) as opened:
+            opened.render(spp=4)
+            image = opened.image()
+        seen.append((image.stats["table_halvings"], image.rgb.mean(), image.stats["cells"]["load"]))
+    assert [halvings for halvings, _, _ in seen] == [0, 1]
+    assert seen[0][1] == pytest.approx(seen[1][1], rel=0.03)
+    # As many cells in half of the slots.
+    assert seen[1][2] == pytest.approx(2 * seen[0][2], rel=0.1)
 
 
 def test_no_buffer_is_larger_than_the_device_allows():

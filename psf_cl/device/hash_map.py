@@ -9,10 +9,18 @@ from psf_cl.device.layout import CONSTANT
 #: Bits of a sum that samples may fill.
 SUM_BITS = 63
 
+#: Slots of a table that is halved at least, where there is too little room.
+LEAST_SLOTS = 1 << 12
+
 
 def slots_for(keys: int) -> int:
     """Return the least power of two that has room for ``keys`` distinct keys."""
     return 1 << max(keys - 1, 0).bit_length()
+
+
+def smaller(slots: int, halvings: int) -> int:
+    """Return the slots of a table of ``slots`` that was halved so often, down to LEAST_SLOTS."""
+    return max(slots >> halvings, min(slots, LEAST_SLOTS))
 
 
 def buckets_of(slots: int) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from psf_cl.device import layout
-from psf_cl.device.hash_map import SUM_BITS, buckets_of, fixed_point, slots_for
+from psf_cl.device.hash_map import SUM_BITS, buckets_of, fixed_point, slots_for, smaller
 from psf_cl.scene.model import Scene
 from psf_cl.settings import Settings
 from psf_cl.stages.cells import HEADROOM, brightest, pixel_per_meter
@@ -21,16 +21,19 @@ LEAST_SLOTS, MOST_SLOTS = 1 << 16, 1 << 20
 MOST_VISITS = 1 << 28
 
 
-def slots_of(pixel_count: int) -> int:
+def slots_of(pixel_count: int, halvings: int = 0) -> int:
     """Return the slots of the table."""
-    return min(max(slots_for(pixel_count // PIXELS_PER_SLOT), LEAST_SLOTS), MOST_SLOTS)
+    slots = min(max(slots_for(pixel_count // PIXELS_PER_SLOT), LEAST_SLOTS), MOST_SLOTS)
+    return smaller(slots, halvings)
 
 
-def parameters(scene: Scene, settings: Settings, pixel_count: int) -> dict[str, Any]:
+def parameters(
+    scene: Scene, settings: Settings, pixel_count: int, halvings: int = 0
+) -> dict[str, Any]:
     """Return what the kernels need to know, by the names of ``layout.PARAMS``."""
     steps = fixed_point(HEADROOM * brightest(scene), MOST_VISITS)
     return {
-        "cache_slots": slots_of(pixel_count),
+        "cache_slots": slots_of(pixel_count, halvings),
         "cache_width": settings.cache_cell_size * pixel_per_meter(scene),
         "cache_steps": steps,
         "cache_limit": 2.0**SUM_BITS / steps / MOST_VISITS,
@@ -42,7 +45,7 @@ def plan(context: Context) -> StageSpec | None:
     """Return the stage, or None if paths do not end by it."""
     if not context.on("CACHE"):
         return None
-    slots = slots_of(context.pixel_count)
+    slots = slots_of(context.pixel_count, context.table_halvings)
     uint32 = np.dtype(np.uint32)
     sums, cells = layout.CACHE_SUM.dtype, layout.CACHE_CELL.dtype
     buffers = (

@@ -22,7 +22,7 @@ def plan(context: Context) -> StageSpec | None:
     """Return the stage, or None if cells begin anew with each frame."""
     if not context.on("CELL_HISTORY"):
         return None
-    slots, uint32 = slots_of(context.pixel_count), np.dtype(np.uint32)
+    slots, uint32 = slots_of(context.pixel_count, context.table_halvings), np.dtype(np.uint32)
     pixels = context.pixel_count
     cell, record = layout.CELL.dtype, layout.CELL_HISTORY.dtype
     buffers = (

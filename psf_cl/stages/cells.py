@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from psf_cl.device import layout
-from psf_cl.device.hash_map import SUM_BITS, buckets_of, fixed_point, slots_for
+from psf_cl.device.hash_map import SUM_BITS, buckets_of, fixed_point, slots_for, smaller
 from psf_cl.scene.model import Scene
 from psf_cl.settings import Settings
 from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
@@ -34,26 +34,28 @@ VIEWS = {
 TRACING = ("WALLS", "FEW", "INSTANCES", "ALPHA", "VERTEX_COLORS")
 
 
-def slots_of(pixel_count: int) -> int:
+def slots_of(pixel_count: int, halvings: int = 0) -> int:
     """Return the slots of the table of a pass.
 
     As many as there are samples: only where nearly all of them are alone can it overflow, and there
     is nothing to share.
     """
-    return slots_for(pixel_count)
+    return smaller(slots_for(pixel_count), halvings)
 
 
-def buckets(pixel_count: int) -> int:
+def buckets(pixel_count: int, halvings: int = 0) -> int:
     """Return the buckets of the table of a pass."""
-    return buckets_of(slots_of(pixel_count))
+    return buckets_of(slots_of(pixel_count, halvings))
 
 
-def parameters(scene: Scene, settings: Settings, pixel_count: int) -> dict[str, Any]:
+def parameters(
+    scene: Scene, settings: Settings, pixel_count: int, halvings: int = 0
+) -> dict[str, Any]:
     """Return what the kernels need to know, by the names of ``layout.PARAMS``."""
     steps = fixed_point(HEADROOM * brightest(scene), pixel_count)
     return {
         "cell_min_count": settings.cell_min_count,
-        "cell_slots": slots_of(pixel_count),
+        "cell_slots": slots_of(pixel_count, halvings),
         "cell_flags": layout.CONSTANT["CELL_JITTER"] * settings.cell_jitter
         + layout.CONSTANT["CELL_NEAR"] * settings.cell_near,
         "cell_directions": settings.cell_directions,
@@ -122,7 +124,7 @@ def plan(context: Context) -> StageSpec | None:
     if not context.on("CELLS") or context.range_search:
         return None
     walls = context.on("WALLS")
-    slots = slots_of(context.pixel_count)
+    slots = slots_of(context.pixel_count, context.table_halvings)
     cell, uint32 = layout.CELL.dtype, np.dtype(np.uint32)
     buffers = (
         *sample_buffers(context),

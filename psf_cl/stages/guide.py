@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from psf_cl.device import layout
-from psf_cl.device.hash_map import SUM_BITS, buckets_of, fixed_point, slots_for
+from psf_cl.device.hash_map import SUM_BITS, buckets_of, fixed_point, slots_for, smaller
 from psf_cl.scene.model import Scene
 from psf_cl.settings import Settings
 from psf_cl.stages.cells import HEADROOM, brightest, pixel_per_meter
@@ -48,18 +48,19 @@ PASSES_WITHOUT = 256
 VIEWS = {"guide": "direction", "guide_entropy": "entropy", "visits": "visits"}
 
 
-def slots_of(pixel_count: int) -> int:
+def slots_of(pixel_count: int, halvings: int = 0) -> int:
     """Return the slots of the table."""
-    return min(max(slots_for(pixel_count // PIXELS_PER_SLOT), LEAST_SLOTS), MOST_SLOTS)
+    slots = min(max(slots_for(pixel_count // PIXELS_PER_SLOT), LEAST_SLOTS), MOST_SLOTS)
+    return smaller(slots, halvings)
 
 
 def parameters(
-    scene: Scene, settings: Settings, pixel_count: int, scene_radius: float
+    scene: Scene, settings: Settings, pixel_count: int, scene_radius: float, halvings: int = 0
 ) -> dict[str, Any]:
     """Return what the kernels need to know, by the names of ``layout.PARAMS``."""
     steps = fixed_point(HEADROOM * brightest(scene), MOST_VISITS)
     return {
-        "guide_slots": slots_of(pixel_count),
+        "guide_slots": slots_of(pixel_count, halvings),
         "guide_width": settings.guide_cell_size * pixel_per_meter(scene),
         "guide_least": LEAST_EDGE * scene_radius,
         "guide_most": MOST_EDGE * scene_radius,
@@ -104,7 +105,7 @@ def plan(context: Context) -> StageSpec | None:
     """Return the stage, or None if directions are not guided."""
     if not context.on("GUIDE"):
         return None
-    slots = slots_of(context.pixel_count)
+    slots = slots_of(context.pixel_count, context.table_halvings)
     uint32 = np.dtype(np.uint32)
     sums, cells = layout.GUIDE_SUM.dtype, layout.GUIDE_CELL.dtype
     buffers = (

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from psf_cl.device import layout
-from psf_cl.device.hash_map import buckets_of, slots_for
+from psf_cl.device.hash_map import buckets_of, slots_for, smaller
 from psf_cl.scene.model import Scene
 from psf_cl.settings import Settings
 from psf_cl.stages.cells import pixel_per_meter
@@ -19,15 +19,17 @@ LEAST_SLOTS, MOST_SLOTS = 1 << 16, 1 << 20
 BUFFERS = ("material_keys", "material_full", "material_sums", "material_cells")
 
 
-def slots_of(pixel_count: int) -> int:
+def slots_of(pixel_count: int, halvings: int = 0) -> int:
     """Return the slots of the table."""
-    return min(max(slots_for(pixel_count), LEAST_SLOTS), MOST_SLOTS)
+    return smaller(min(max(slots_for(pixel_count), LEAST_SLOTS), MOST_SLOTS), halvings)
 
 
-def parameters(scene: Scene, settings: Settings, pixel_count: int) -> dict[str, Any]:
+def parameters(
+    scene: Scene, settings: Settings, pixel_count: int, halvings: int = 0
+) -> dict[str, Any]:
     """Return what the kernels need to know, by the names of ``layout.PARAMS``."""
     return {
-        "material_slots": slots_of(pixel_count),
+        "material_slots": slots_of(pixel_count, halvings),
         "material_width": settings.material_cell_size * pixel_per_meter(scene),
     }
 
@@ -36,7 +38,7 @@ def plan(context: Context) -> StageSpec | None:
     """Return the stage, or None if every vertex looks its textures up."""
     if not context.on("MATERIAL_CELLS"):
         return None
-    slots = slots_of(context.pixel_count)
+    slots = slots_of(context.pixel_count, context.table_halvings)
     uint32 = np.dtype(np.uint32)
     sums, cells = layout.MATERIAL_SUM.dtype, layout.MATERIAL_CELL.dtype
     buffers = (

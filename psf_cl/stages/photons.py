@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from psf_cl.device import layout
+from psf_cl.device.hash_map import smaller
 from psf_cl.settings import Settings
 from psf_cl.stages.spec import POOL_FLAGS, BufferSpec, Context, KernelSpec, StageSpec
 
@@ -56,13 +57,18 @@ def photons_for(settings: Settings, paths: int, rays: Mapping[str, int]) -> int:
     return int(min(max(settings.photon_share * traced * paths, FEWEST), MOST))
 
 
-def parameters(settings: Settings, light_count: int) -> dict[str, object]:
+def cells_of(halvings: int = 0) -> int:
+    """Return the cells of a map that was halved so often."""
+    return smaller(CELLS, halvings)
+
+
+def parameters(settings: Settings, light_count: int, halvings: int = 0) -> dict[str, object]:
     """Return what the kernels need to know, by the names of ``layout.PARAMS``."""
     return {
         "virtual_clearance": settings.virtual_clearance,
         "node_bits": max(2 * light_count - 1, 0).bit_length(),
         "shadow_rays": 0 if settings.shadow_rays == "auto" else int(settings.shadow_rays),
-        "particle_cells": CELLS,
+        "particle_cells": cells_of(halvings),
         "particle_cell": settings.photon_cell,
         "photon_floor": settings.photon_floor,
     }
@@ -75,7 +81,8 @@ def plan(context: Context) -> StageSpec | None:
     if not (mapped or context.on("VIRTUAL_LIGHTS")):
         return None
     uint32 = np.dtype(np.uint32)
-    places = CELLS * PLACES
+    map_cells = cells_of(context.table_halvings)
+    places = map_cells * PLACES
     kind_words = KIND_WORDS + (choice == 3)
     record_words = RECORD_WORDS + kind_words * layout.CONSTANT["PARTICLE_KINDS"]
     words = context.traits.slots * context.path_field_count
@@ -107,7 +114,7 @@ def plan(context: Context) -> StageSpec | None:
         BufferSpec("particle_keys", uint32, places, "least random number of each place"),
         BufferSpec("particle_counts", uint32, places, "photons that came to it"),
         BufferSpec("particle_words", uint32, places, "light and cell of the one that stayed"),
-        BufferSpec("particle_table", uint32, CELLS * record_words, "what each cell knows"),
+        BufferSpec("particle_table", uint32, map_cells * record_words, "what each cell knows"),
     )
     if choice == 3:
         what = "where on its light that one started"
@@ -164,6 +171,7 @@ class PhotonMap:
                 own.bind_planned("settle_photons", buffers),
             )
             self.tabulate = own.bind_planned("tabulate_photons", buffers)
+            self.cells = buffers["particle_keys"].count // PLACES
         self.virtual_lights = virtual_lights
         self.trace = programs["intersect"].bind_planned("intersect_closest", traced)
         self.trace_items = -(-traits.slots // runs_per_trace)
@@ -200,7 +208,7 @@ class PhotonMap:
                     self.trace(self.trace_items)
                     self.virtual_lights.scatter_all(items)
         if self.tabulate is not None:
-            self.tabulate(CELLS)
+            self.tabulate(self.cells)
 
     def counts(self) -> dict[str, int]:
         """Return what became of the photons so far, by the names of ``layout.PHOTON_COUNTERS``."""

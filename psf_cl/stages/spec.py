@@ -137,6 +137,7 @@ class Context:
         ring: passes that may be in flight, a power of two.
         crop_size: width and height of what is rendered, pixels.
         range_search: whether light is shared in balls, not in cells.
+        table_halvings: how often the hash tables were halved, for want of room.
     """
 
     features: dict[str, Feature]
@@ -156,6 +157,7 @@ class Context:
     halves: bool = False
     moving: MovingCounts | None = None
     range_search: bool = False
+    table_halvings: int = 0
 
     @property
     def path_field_count(self) -> int:
