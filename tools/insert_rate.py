@@ -1,6 +1,6 @@
 """Rate of the table of cells: ``python tools/insert_rate.py``.
 
-Processor time (of all threads) of a sample: inserting it, the same four atomic adds to a random
+Processor time (of all threads) of a sample: inserting it, as many atomic adds to a random
 cell of a table of the same bytes without any search, and looking it up.  The number of distinct
 keys stays the same while the table grows: it is searched less, but fits into fewer caches.
 
