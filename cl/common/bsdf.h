@@ -302,14 +302,16 @@ LARGE_FUNCTION Vec3 eval_bsdf(Bsdf b, LobeChances chances, Vec3 wo, Vec3 wi, Flo
     density += pick(chances.reflect > 0.0f, chances.reflect * seen_mirrored, (Float)(0.0f));
 #if TRANSMISSION
     // What was to be refracted by a facet that reflects all.
-    Vec3 none;
-    const Mask returns = cannot_pass(b, wo, h, cos_h, &none) & (chances.refract > 0.0f) & !b.thin;
-    density += pick(returns, chances.refract * ggx_d(h, alpha) / (2.0f * (wo.z + ggx_stretch(wo, alpha))), (Float)(0.0f));
+    Mask returns = 1.0f - cos_h * cos_h >= b.eta * b.eta;
     if (any_lane(above & inside)) {
+        Vec3 none;
+        returns |= inside & cannot_pass(b, wo, h, cos_h, &none);
         const Thrown thrown = thrown_back(b, alpha, wo, vec3(wi.x, wi.y, -cos_i));
         value = add(value, vec3_all(pick(inside, share * thrown.light, (Float)(0.0f))));
         density += pick(inside, chances.refract * thrown.drawn, (Float)(0.0f));
     }
+    returns &= (chances.refract > 0.0f) & !b.thin;
+    density += pick(returns, chances.refract * ggx_d(h, alpha) / (2.0f * (wo.z + ggx_stretch(wo, alpha))), (Float)(0.0f));
 #endif
 #if LAYERS
     value = scale(value, chances.under_coat);
