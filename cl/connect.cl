@@ -42,13 +42,14 @@ static inline uint connect_paths(
                        - pick_u((status & STATUS_MASK) == STATUS_ALIVE, (UInt)(1u), (UInt)(0u));
 #endif
 #if CELLS
-    const UInt vertex = get_u(path, PATH_VERTEX) & VERTEX_MASK;
+    const UInt known = get_u(path, PATH_VERTEX);
+    const UInt vertex = known & VERTEX_MASK;
 #if CELLS == 2
     const Vec3 share = get_v(path, RAY_FIELD(ray, LIGHT_SHARE_R));
 #else
     const Vec3 share = vec3_all((Float)(1.0f));
 #endif
-    const Mask shared = shares_connection(params, vertex, depth);
+    const Mask shared = shares_connection(params, vertex, depth, (known & VERTEX_SKY) != 0u);
     const Vec3 rest = gather_light(path, shared, share, arrives);
     const Mask reflected = !((vertex == 1u) & shared);
 #else

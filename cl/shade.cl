@@ -305,6 +305,9 @@ kernel void shade_paths(
 #endif
 #endif
 
+#if CELLS
+    Mask even_sky = (Mask)(0);
+#endif
 #if ENVIRONMENT
     const Mask missed = alive & !hit;
     if (any_lane(missed)) {
@@ -325,6 +328,9 @@ kernel void shade_paths(
 #endif
         const Float weight = emission_weight(params, camera_ray, pdf_bsdf, pdf_light);
         emitted = pick_v(missed, scale(radiance, weight), emitted);
+#if CELLS
+        even_sky = missed & is_even_sky(params, radiance);
+#endif
     }
 #endif
 
@@ -382,7 +388,7 @@ kernel void shade_paths(
 
     const Vec3 brought = pick_v(alive, mul(beta, emitted), zero);
 #if CELLS
-    const UInt known = pick_u(camera_ray, (UInt)(0u), get_u(path, PATH_VERTEX));
+    const UInt known = pick_u(camera_ray, (UInt)(0u), get_u(path, PATH_VERTEX) & ~(uint)VERTEX_SKY);
     const UInt vertex = known & VERTEX_MASK;
     const Float length = pick(camera_ray, (Float)(0.0f), FIELD(path, PATH_LENGTH)) + FIELD(path, PATH_HIT_T);
     FIELD(path, PATH_LENGTH) = length;
@@ -390,13 +396,13 @@ kernel void shade_paths(
     put_u(path, PATH_VERTEX, known | near_bit(params, hit, vertex, depth, length, FIELD(path, PATH_HIT_T), s.ng));
 #if CELLS == 2
     Vec3 share = get_v(path, PATH_SHARE_R);
-    const Vec3 rest = gather_light(path, shares_emission(params, vertex, depth), share, brought);
 #else
-    const Vec3 rest =
-        gather_light(path, shares_emission(params, vertex, depth), vec3_all((Float)(1.0f)), brought);
+    const Vec3 share = vec3_all((Float)(1.0f));
 #endif
+    const Mask shared = shares_emission(params, vertex, depth, even_sky);
+    const Vec3 rest = gather_light(path, shared, share, brought);
     // What the first surface did not share is none of its base's.
-    const Mask reflected = !camera_ray & !((vertex == 1u) & shares_emission(params, vertex, depth));
+    const Mask reflected = !camera_ray & !((vertex == 1u) & shared);
 #else
     put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), brought));
     const Vec3 rest = brought;
@@ -568,10 +574,10 @@ kernel void shade_paths(
         const Vec3 taken = pick_v(ends > 0.0f, scale(mul(beta, reflected_here), pick(ended, (Float)(1.0f), 1.0f - on)), zero);
         beta = scale(beta, on);
 #if CELLS == 2
-        const Vec3 left = gather_light(path, shares_connection(params, vertex, depth), share, taken);
+        const Vec3 left = gather_light(path, shares_connection(params, vertex, depth, (Mask)(0)), share, taken);
 #elif CELLS
         const Vec3 left =
-            gather_light(path, shares_connection(params, vertex, depth), vec3_all((Float)(1.0f)), taken);
+            gather_light(path, shares_connection(params, vertex, depth, (Mask)(0)), vec3_all((Float)(1.0f)), taken);
 #else
         put_v(path, PATH_RADIANCE_R, add(get_v(path, PATH_RADIANCE_R), taken));
         const Vec3 left = taken;
@@ -679,6 +685,13 @@ kernel void shade_paths(
 #endif
                                                    sends, above, unit_float(place.first), unit_float(place.second),
                                                    seed, index, ray_pair, choice);
+#if CELLS && ENVIRONMENT && !SHADOW_RAYS
+            // Of several rays one bit could not tell.
+            const UInt its_vertex = get_u(path, PATH_VERTEX);
+            const Mask even = sends & (choice.light == params->environment_light) & is_even_sky(params, light.radiance)
+                              & ((its_vertex & VERTEX_MASK) == depth + 1u);
+            put_u(path, PATH_VERTEX, its_vertex | pick_u(even, (UInt)(VERTEX_SKY), (UInt)(0u)));
+#endif
             const Vec3 wi_local = vec3(dot3(tangent, light.wi), dot3(bitangent, light.wi), dot3(s.ns, light.wi));
             Float pdf;
             const Vec3 f = eval_bsdf(b, chances, wo_local, wi_local, dot3(s.ng, light.wi), &pdf);
@@ -761,7 +774,8 @@ kernel void shade_paths(
     share = pick_v(chosen, by_base, share);
     const Mask by_gloss = max3(by_base) < LEAST_SHARE;
     // Of a path that goes on by a coat the base's cell would get little: a later vertex may share its light.
-    const Mask gives_up = chosen & by_gloss & (Mask)(params->filter_direct ? 0 : -1);
+    const Mask gives_up = chosen & by_gloss & (Mask)(params->filter_direct ? 0 : -1)
+                          & ((get_u(path, PATH_VERTEX) & VERTEX_SKY) == 0u);
     UInt shared_at = pick_u(gives_up, (UInt)(0u), get_u(path, PATH_VERTEX));
 #if CELL_LAYERS
     const Mask wide = goes_on & by_gloss & !delta & (drawn.z > 0.0f) & (b.alpha >= LEAST_CELL_ALPHA);

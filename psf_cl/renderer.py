@@ -889,6 +889,7 @@ class Renderer:
             "environment_width": 1 if image is None else image.shape[1],
             "environment_height": 1 if image is None else image.shape[0],
             "environment_radiance": scene.environment.radiance,
+            "sky_limit": cells.sky_limit(settings, tables.environment_mean(scene.environment)),
             "environment_rotation": np.asarray(scene.environment.rotation).T.reshape(9),
             "scene_radius": max(geometry.radius, float(np.finfo(np.float32).tiny)),
             "scene_center": geometry.center,

@@ -193,6 +193,9 @@ class Settings:
     filter_direct: bool = _switch(
         True, doc="share the light too that falls on that vertex directly"
     )
+    filter_sky: bool = _switch(
+        False, doc="share of that the light of the sky, but for its bright spots"
+    )
     filter_restore: bool = _switch(
         False,
         doc="add what averages lost back where it stands out of the noise: consistent",
@@ -311,11 +314,13 @@ def _checked(item: dataclasses.Field[Any], value: Any, prefix: str) -> Any:
 
 PRESETS: dict[str, dict[str, Any]] = {
     "pt": {},
-    # Shadows of direct light are sharper than any cell; all other light is shared where it is seen.
+    # Shadows of lamps and of the sun are sharper than any cell; all other light is shared where it
+    # is seen.
     "psf": {
         "path_filter": "hash_grid",
         "filter_vertex": "1",
         "filter_direct": False,
+        "filter_sky": True,
         # What large cells blur is put back (measured: less error at all times than smaller cells,
         # or cells that shrink, have).
         "filter_restore": True,
@@ -332,6 +337,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "path_filter": "hash_grid",
         "filter_vertex": "1",
         "filter_direct": False,
+        "filter_sky": True,
         "temporal": "adaptive",
         "screen_filter": "path_space",
     },

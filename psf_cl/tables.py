@@ -594,7 +594,7 @@ def light_table(
     radius = max(geometry.radius, 1e-30)
     if sky:
         table["kind"][at] = layout.CONSTANT["LIGHT_ENVIRONMENT"]
-        mean = _environment_mean(scene.environment) @ LUMINANCE
+        mean = environment_mean(scene.environment) @ LUMINANCE
         power[at] = 4.0 * math.pi * mean * math.pi * radius**2
         table["power"][at] = math.pi * mean
         far[at] = True
@@ -673,7 +673,8 @@ def _environment_weights(image: np.ndarray) -> np.ndarray:
     return ((edges[:-1] - edges[1:]) * (2.0 * np.pi / width))[:, None]
 
 
-def _environment_mean(environment: Environment) -> np.ndarray:
+def environment_mean(environment: Environment) -> np.ndarray:
+    """Return the radiance of the sky on average over all directions, ``(3,)``."""
     factor = np.asarray(environment.radiance, np.float64)
     if environment.image is None:
         return factor

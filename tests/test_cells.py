@@ -342,10 +342,11 @@ def shiny(size=(48, 32)):
 
 
 @pytest.mark.parametrize("vertex", ["1", pytest.param("2", marks=pytest.mark.slow), "auto"])
-@pytest.mark.parametrize("direct", [True, False])
+@pytest.mark.parametrize("direct", [True, False, "sky"])
 def test_only_what_the_base_reflects_is_shared_and_all_of_it_arrives(device, vertex, direct):
     expected = render(device, shiny(), 8).rgb
-    settings = {"filter_vertex": vertex, "filter_direct": direct, "cell_size": 1.0}
+    share = {"filter_direct": direct is True, "filter_sky": direct == "sky"}
+    settings = {"filter_vertex": vertex, **share, "cell_size": 1.0}
     opened = renderer(device, shiny(), **FILTER, **settings)
     assert opened.plan.features["CELLS"].value == 2
     identity = layout.CONSTANT["CELL_IDENTITY"]
@@ -353,6 +354,37 @@ def test_only_what_the_base_reflects_is_shared_and_all_of_it_arrives(device, ver
     # Colours are divided and multiplied once more than where all light is shared.
     np.testing.assert_allclose(image.rgb, expected, rtol=2e-5, atol=2e-6)
     assert image.stats["cells"]["cells_per_pass"] > 50
+
+
+def under_a_sky(environment):
+    """Return a matt box on a floor that only the sky lights."""
+    box = transform.translation((0, 0.4, 0)) @ transform.scaling(0.4)
+    parts = [floor(3.0, lambertian(0.7)), (primitives.box(), box, lambertian((0.3, 0.6, 0.8)))]
+    scene = build(parts, camera((0, 1.5, 3), (0, 0.5, 0), 45), (48, 32))
+    return replace(scene, environment=environment)
+
+
+def test_an_even_sky_is_shared_as_all_direct_light_is(device):
+    image = np.random.default_rng(1).random((8, 16, 3), np.float32)
+    scene = under_a_sky(Environment((0.5, 0.6, 0.8), image))
+    ways = {**FILTER, "filter_vertex": "1"}
+    sky = render(device, scene, 4, **ways, filter_direct=False, filter_sky=True).rgb
+    everything = render(device, scene, 4, **ways, filter_direct=True).rgb
+    nothing = render(device, scene, 4, **ways, filter_direct=False).rgb
+    np.testing.assert_array_equal(sky, everything)
+    assert np.abs(sky - nothing).mean() > 0.01
+
+
+def test_light_of_the_sun_is_no_sky_s(device):
+    """Of a sky that is black but for a spot only what a look-up finds of its edge is even."""
+    image = np.zeros((64, 128, 3), np.float32)
+    image[16:18, 60:62] = 1000.0
+    scene = under_a_sky(Environment((1.0, 1.0, 1.0), image))
+    ways = {**FILTER, "filter_vertex": "1"}
+    sky = render(device, scene, 4, **ways, filter_direct=False, filter_sky=True).rgb
+    everything = render(device, scene, 4, **ways, filter_direct=True).rgb
+    nothing = render(device, scene, 4, **ways, filter_direct=False).rgb
+    assert np.abs(sky - nothing).mean() < 0.1 * np.abs(everything - nothing).mean()
 
 
 def test_a_mirror_image_stays_sharp_under_the_filter(device):

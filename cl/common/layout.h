@@ -66,6 +66,7 @@
 #define VERTEX_WALL_SHIFT 24u // first bit of what separates the vertex from where it is stored
 #define VERTEX_WALL_MASK 7u // of that, shifted: 0 nothing, or 1 + the side that a wall faces
 #define VERTEX_GLOSSY 0x00200000u // set if what is shared is what coats and metals reflect there
+#define VERTEX_SKY 0x00400000u // set if its shadow ray goes where the sky is even: that light is shared
 #define VERTEX_MASK 0x001FFFFFu // 1 + depth
 #define CELL_JITTER 1u // points are moved before they are told apart by cells
 #define CELL_NEAR 4u // samples of light from near have cells of their own
@@ -499,6 +500,7 @@ typedef struct {
     float cell_limit; // radiance from which a sample is too large for the sums
     uint filter_vertex; // first vertex whose light may be shared; FILTER_AUTO, FILTER_NONE
     uint filter_direct; // whether light that falls on it directly is shared too
+    float sky_limit; // luminance up to which light of the sky is shared anyway; below 0: none
     float screen_radius; // pixels; the screen filter's neighbours of a pixel's first sample
     uint screen_neighbours; // of a pixel, that the screen filter asks
     uint temporal_rule; // RULE_OFF, RULE_EXPONENTIAL, RULE_CUMULATIVE or RULE_ADAPTIVE
@@ -533,7 +535,7 @@ typedef struct {
     float cache_trace; // least chance that a path goes on where a cell is known
     uint material_slots; // of the table of the parameter cloud, a power of two
     float material_width; // edge of its cells, m per m from the camera
-    uint pad[2]; // fills the record
+    uint pad[1]; // fills the record
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.

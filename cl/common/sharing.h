@@ -8,16 +8,25 @@
 #include "unit_vector.h"
 
 #if CELLS
-/// Whether light that arrives at the vertex of `depth`, which found it itself, is shared.
-static inline Mask shares_emission(__global const Params *params, UInt vertex, UInt depth)
+/// Whether the sky is even where it has this radiance: its shadows are soft.
+static inline Mask is_even_sky(__global const Params *params, Vec3 radiance)
 {
-    return (vertex != 0u) & (depth + params->filter_direct > vertex);
+    return luminance(radiance) <= params->sky_limit;
+}
+
+/// Whether light that arrives at the vertex of `depth`, which found it itself, is shared; `even` where it is
+/// that of an even sky.
+static inline Mask shares_emission(__global const Params *params, UInt vertex, UInt depth, Mask even)
+{
+    const UInt direct = pick_u(even, (UInt)(1u), (UInt)(params->filter_direct));
+    return (vertex != 0u) & (depth + direct > vertex);
 }
 
 /// Whether light of a shadow ray from the vertex of `depth` is shared.
-static inline Mask shares_connection(__global const Params *params, UInt vertex, UInt depth)
+static inline Mask shares_connection(__global const Params *params, UInt vertex, UInt depth, Mask even)
 {
-    return (vertex != 0u) & (depth + params->filter_direct >= vertex);
+    const UInt direct = pick_u(even, (UInt)(1u), (UInt)(params->filter_direct));
+    return (vertex != 0u) & (depth + direct >= vertex);
 }
 
 /// Add radiance to what a path gathered: `share` of the lanes of `shared` to what came from beyond its

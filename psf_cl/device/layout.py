@@ -122,6 +122,7 @@ PARAMS = Record(
     float cell_limit - radiance from which a sample is too large for the sums
     uint filter_vertex - first vertex whose light may be shared; FILTER_AUTO, FILTER_NONE
     uint filter_direct - whether light that falls on it directly is shared too
+    float sky_limit - luminance up to which light of the sky is shared anyway; below 0: none
     float screen_radius - pixels; the screen filter's neighbours of a pixel's first sample
     uint screen_neighbours - of a pixel, that the screen filter asks
     uint temporal_rule - RULE_OFF, RULE_EXPONENTIAL, RULE_CUMULATIVE or RULE_ADAPTIVE
@@ -1118,6 +1119,11 @@ CONSTANTS = (
     ("VERTEX_WALL_SHIFT", 24, "first bit of what separates the vertex from where it is stored"),
     ("VERTEX_WALL_MASK", 7, "of that, shifted: 0 nothing, or 1 + the side that a wall faces"),
     ("VERTEX_GLOSSY", 0x200000, "set if what is shared is what coats and metals reflect there"),
+    (
+        "VERTEX_SKY",
+        0x400000,
+        "set if its shadow ray goes where the sky is even: that light is shared",
+    ),
     ("VERTEX_MASK", 0x1FFFFF, "1 + depth"),
     ("CELL_JITTER", 1, "points are moved before they are told apart by cells"),
     ("CELL_NEAR", 4, "samples of light from near have cells of their own"),

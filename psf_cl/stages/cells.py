@@ -9,12 +9,15 @@ import numpy as np
 
 from psf_cl.device import layout
 from psf_cl.device.hash_map import SUM_BITS, buckets_of, fixed_point, slots_for, smaller
-from psf_cl.scene.model import Scene
+from psf_cl.scene.model import LUMINANCE, Scene
 from psf_cl.settings import Settings
 from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
 
 #: A sample may be so many times as bright as the brightest light before it is not shared.
 HEADROOM = 1024.0
+
+#: Brighter than so many times its mean the sky has a sun, or a lamp, whose shadows are sharp.
+EVEN_SKY = 10.0
 
 #: Cells of pass n have the edge n^(-1/6) of those of pass 1: bias falls as n^(-1/3), and so
 #: does the noise, n^(-2/3) in variance.
@@ -66,6 +69,15 @@ def parameters(
         "filter_vertex": _vertex(settings),
         "filter_direct": int(settings.filter_direct),
     }
+
+
+def sky_limit(settings: Settings, mean: np.ndarray) -> float:
+    """Return the luminance up to which direct light of the sky is shared, -1 for none.
+
+    Args:
+        mean: radiance of the sky over all directions, ``(3,)``.
+    """
+    return EVEN_SKY * float(mean @ LUMINANCE) if settings.filter_sky else -1.0
 
 
 def pixel_per_meter(scene: Scene) -> float:
