@@ -646,6 +646,7 @@ class Renderer:
                 "noise": "film_half" in self.buffers,
             },
             "loaded cache": self.loaded,
+            "size of hash tables": self.plan.table_halvings,
         }
 
     def _lasting(self) -> dict[str, tuple[np.dtype[Any], int]]:

@@ -82,7 +82,9 @@ def test_where_a_small_pool_does_not_do_tables_are_smaller_too():
         make_plan(large, many, room=Room(floor.peak_bytes - 1))
 
 
-def test_a_render_with_smaller_tables_shares_less_and_is_as_bright(device):
+def test_a_render_with_smaller_tables_shares_less_is_as_bright_and_resumes_no_other(
+    device, tmp_path
+):
     few = two_lights((96, 64), columns=6)
     values = {"path_filter": "hash_grid", "guiding": "learned", "light_sampling": "photon"}
     settings = Settings().with_values(values | {"cell_size": 1.0})
@@ -90,7 +92,11 @@ def test_a_render_with_smaller_tables_shares_less_and_is_as_bright(device):
     seen = []
     for room in (None, Room(least.peak_bytes - 1)):
         with contextlib.closing(Renderer(few, settings, device, room=room)) as opened:
+            if room is not None:
+                with pytest.raises(InputError, match="is of another size of hash tables"):
+                    opened.resume(tmp_path / "whole")
             opened.render(spp=4)
+            assert opened.save(tmp_path / "whole")
             image = opened.image()
         seen.append((image.stats["table_halvings"], image.rgb.mean(), image.stats["cells"]["load"]))
     assert [halvings for halvings, _, _ in seen] == [0, 1]
