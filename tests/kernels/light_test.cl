@@ -31,13 +31,11 @@ kernel void sample_lights(
     const UInt seed = pixel_seed(LOAD_U(pixel, 0), params->seed);
     const UInt index = reverse_bits(LOAD_U(sample, 0));
     const UInt pair = (UInt)(PAIR_VERTEX);
-    UInt unused_bits;
-    UInt choice;
-    sample_bits(seed, index, pair + PAIR_CHOICE, params->sampler, &unused_bits, &choice);
+    const VertexBits numbers = vertex_bits(seed, index, pair, params->sampler);
     LightQuery query;
     query.p = LOAD_V(origin, 0);
     query.n = query.p;
-    const LightChoice light = choose_light(params, lights, LOAD_U(active, 0) != 0u, query, choice);
+    const LightChoice light = choose_light(params, lights, LOAD_U(active, 0) != 0u, query, numbers.choice.second);
     const LightSample s = sample_light(params, lights, surfaces, materials,
 #if TEXTURES
                                        uvs, textures, texels, srgb_to_linear,
@@ -45,7 +43,8 @@ kernel void sample_lights(
 #if ENVIRONMENT == 2
                                        cells,
 #endif
-                                       LOAD_U(active, 0) != 0u, LOAD_V(origin, 0), seed, index, pair, light);
+                                       LOAD_U(active, 0) != 0u, LOAD_V(origin, 0), unit_float(numbers.light.first),
+                                       unit_float(numbers.light.second), seed, index, pair, light);
     store_vec3(toward, 0, s.toward);
     store_vec3(wi, 0, s.wi);
     store_vec3(radiance, 0, s.radiance);
