@@ -38,25 +38,29 @@ class DeviceTraits:
             )
 
     @classmethod
-    def of_kind(cls, kind: str) -> DeviceTraits:
-        """Return the table's row for ``kind``.
+    def of_kind(cls, kind: str, register_floats: int = 16) -> DeviceTraits:
+        """Return the table's row for ``kind``, and for what floats a register of a CPU holds.
 
         CPU: PoCL vectorises only what is written as vectors, 16 lanes shade a vertex in 6 ns where
         scalar code takes 27 to 83; 16k to 64k slots and groups of 1 to 16 are equally fast, runs of
         1 cost intersect and connect a tenth (two cores meet at one counter).  Whole renders of a
         room without a tree take 0.87 of the time at 66 plates, 1.15 at 98, and triangles that move,
-        looked at corner by corner, 0.4 of that of a tree at 36, about as much at 200.  To
-        measure again: ``python tools/kernel_timing.py SCENE --save a.json``, change the row,
-        ``--baseline a.json``; for cornell_box, ajar_door, glossy and a large scene of one's own.
+        looked at corner by corner, 0.4 of that of a tree at 36, about as much at 200.  With
+        registers of 8 floats (AVX2), 8 lanes in blocks of 8 take 0.81 to 0.88 of the time of 16 in
+        the Cornell box and 0.96 to 1.04 in larger rooms; 8k slots take less at 256x256 (0.75) but
+        more at 1024x1024 (0.98), and in large scenes.  To measure again, ``python
+        tools/kernel_timing.py SCENE --save a.json``, change the row, ``--baseline a.json``; for
+        cornell_box, ajar_door, glossy and a large scene of one's own.
 
         GPU: not measured; a path a work item, blocks of 32 so that neighbours read neighbouring
         words.
         """
         if kind == "cpu":
+            lanes = 8 if register_floats == 8 else 16
             return cls(
                 "cpu",
-                lanes=16,
-                block=16,
+                lanes=lanes,
+                block=lanes,
                 slots=1 << 15,
                 group=8,
                 run=4,

@@ -12,6 +12,7 @@ import pytest
 
 from psf_cl.device import selftest
 from psf_cl.device.advice import driver_command
+from psf_cl.device.device import open_device
 from psf_cl.device.drivers import driver_problems
 from psf_cl.errors import DeviceError
 
@@ -61,12 +62,23 @@ def test_the_device_of_the_tests_passes_in_a_process_of_its_own(device):
 def test_a_wrong_result_fails_the_self_test(device, monkeypatch, right, wrong, part):
     assert right in selftest._SOURCE
     monkeypatch.setattr(selftest, "_SOURCE", selftest._SOURCE.replace(right, wrong))
-    assert selftest.run_self_test(device.cl_device) == f"wrong results: {part}"
+    assert selftest.run_self_test(device.cl_device).reason == f"wrong results: {part}"
+
+
+@pytest.mark.parametrize("register_floats, lanes", [(0, 16), (8, 8), (16, 16)])
+def test_paths_are_as_many_abreast_as_registers_of_the_device_hold(
+    device, monkeypatch, register_floats, lanes
+):
+    stated = selftest._SOURCE.replace("= REGISTER_FLOATS", f"= {register_floats}")
+    monkeypatch.setattr(selftest, "_SOURCE", stated)
+    opened = open_device(device.name)
+    if opened.traits.kind == "cpu":
+        assert opened.traits.lanes == opened.traits.block == lanes
 
 
 def test_a_compiler_error_is_one_line(device, monkeypatch):
     monkeypatch.setattr(selftest, "_SOURCE", selftest._SOURCE.replace("fma(", "no_such_function("))
-    reason = selftest.run_self_test(device.cl_device)
+    reason = selftest.run_self_test(device.cl_device).reason
     assert reason.startswith("cannot compile: ") and "no_such_function" in reason
     assert "\n" not in reason
 
@@ -80,7 +92,7 @@ def test_the_doctor_compiles_anew_for_a_cache_hides_a_broken_compiler(device, mo
 
     monkeypatch.setattr(cl.Program, "build", build)
     for _ in range(2):
-        reason = selftest.run_self_test(device.cl_device, anew=True)
+        reason = selftest.run_self_test(device.cl_device, anew=True).reason
         assert reason == "cannot compile: x.c:1: error: no such thing"
     selftest.run_self_test(device.cl_device)
     selftest.run_self_test(device.cl_device)
@@ -118,10 +130,10 @@ def test_a_loader_that_crashes_is_a_device_error(fake_python):
 
 def test_a_device_of_too_little_memory_is_reported():
     small = types.SimpleNamespace(global_mem_size=64 << 20, max_mem_alloc_size=64 << 20)
-    reason = selftest.run_self_test(small)
+    reason = selftest.run_self_test(small).reason
     assert reason == "too little memory of the device: 64 MiB, 128 are needed"
     small.global_mem_size, small.max_mem_alloc_size = 1 << 40, 8 << 20
-    reason = selftest.run_self_test(small)
+    reason = selftest.run_self_test(small).reason
     assert reason == "too little memory in one buffer: 8 MiB, 32 are needed"
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pyopencl as cl
 
 from psf_cl.device.index_checks import HEADER_WORDS, header_of, violation_in
-from psf_cl.device.selftest import run_self_test
+from psf_cl.device.selftest import SelfTest, run_self_test
 from psf_cl.errors import DeviceError, InputError, NoRoomError
 from psf_cl.measure.timing import TRANSFER, Interval, Spent
 from psf_cl.settings import DEVICE_VARIABLE
@@ -380,13 +380,14 @@ def open_device(
     for device in devices:
         try:
             context = cl.Context([device])
-            reason = run_self_test(device, context)
+            found = run_self_test(device, context)
         except cl.Error as error:
-            reason = str(error)
-        if reason is None:
+            found = SelfTest(str(error))
+        if found.reason is None:
             kind = "cpu" if device.type & cl.device_type.CPU else "gpu"
-            return Device(context, traits or DeviceTraits.of_kind(kind), profiling)
-        failures.append(f"{device.platform.name}: {reason}")
+            traits = traits or DeviceTraits.of_kind(kind, found.register_floats)
+            return Device(context, traits, profiling)
+        failures.append(f"{device.platform.name}: {found.reason}")
     raise DeviceError(
         "no OpenCL device passes the self-test"
         + (f" ({'; '.join(failures)})" if failures else "")

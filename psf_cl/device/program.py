@@ -28,7 +28,9 @@ _SCALARS: dict[str, type[np.generic]] = {
 }
 #: Room for a record of every kind.
 _WARM_UP_BYTES = 4096
-_BUILD_OPTIONS = ("-cl-std=CL1.2", "-cl-kernel-arg-info")
+# No warnings: they would stand between the renderer's own lines, and compilers for CPUs whose
+# registers hold less than 16 floats warn of every function that takes vectors of 16.
+_BUILD_OPTIONS = ("-cl-std=CL1.2", "-cl-kernel-arg-info", "-w")
 
 
 def assemble(file: str, folder: Path | None = None) -> str:
