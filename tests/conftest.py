@@ -32,13 +32,13 @@ def device() -> Device:
 
 @pytest.fixture(
     scope="session",
-    params=[1, pytest.param(8, marks=pytest.mark.slow), 16],
-    ids=lambda lanes: f"W{lanes}",
+    params=["one lane", "its lanes", pytest.param("other lanes", marks=pytest.mark.slow)],
 )
 def lane_device(device: Device, request: pytest.FixtureRequest) -> Device:
-    """Return the same device with kernels for W = 1, 8 (slow tests) and 16 lanes."""
+    """Return the device with kernels for one lane, its own width, or the third of 1, 8, 16."""
     from psf_cl.device.device import Device
     from psf_cl.traits import DeviceTraits
 
-    kind, lanes = device.traits.kind, request.param
+    kind, wide = device.traits.kind, 8 if device.traits.lanes == 8 else 16
+    lanes = {"one lane": 1, "its lanes": wide, "other lanes": 24 - wide}[request.param]
     return Device(device.context, DeviceTraits(kind, lanes, block=16, slots=1024, group=8))

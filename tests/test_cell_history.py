@@ -54,7 +54,7 @@ def test_cells_keep_nothing_unless_frames_share_light():
         assert not any(spec.name.startswith("kept") for s in plan.stages for spec in s.buffers)
 
 
-@pytest.mark.parametrize("rule", ["cumulative", "adaptive"])
+@pytest.mark.parametrize("rule", [pytest.param("cumulative", marks=pytest.mark.slow), "adaptive"])
 def test_a_picture_that_stands_still_has_the_bits_of_its_pixels_histories(device, rule):
     """No cell knows more than the pixels that see it, and none is rejected."""
     scene = room(change=(3, 1.0))

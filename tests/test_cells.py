@@ -286,7 +286,8 @@ def test_same_bits_where_the_table_is_half_full_of_holes(device):
     assert images[0] == images[1] == images[2]
 
 
-@pytest.mark.parametrize(("one", "other"), [(1, 16), pytest.param(8, 16, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("one", "other"), [(1, 16), (8, 16)])
 def test_lane_widths_agree_with_the_filter(device, one, other):
     def image(lanes):
         traits = replace(device.traits, lanes=lanes, block=max(lanes, 8), slots=512)

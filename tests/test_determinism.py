@@ -116,8 +116,9 @@ def test_the_scenes_are_one_with_a_tree_and_one_with_a_list():
     assert not tree.features["FEW"].value and few.features["FEW"].value
 
 
-@pytest.mark.parametrize("slots", [128, 1024])
-@pytest.mark.parametrize("run", [1, 3])
+@pytest.mark.parametrize(
+    ("slots", "run"), [(128, 3), (1024, 1), pytest.param(128, 1, marks=pytest.mark.slow)]
+)
 def test_size_of_the_pool_does_not_show(device, truth, slots, run):
     small = open_device(traits=replace(device.traits, slots=slots, run=run))
     assert_same_bits(render(small, scene(), 40, OUTPUTS), truth)
@@ -153,7 +154,10 @@ def assert_lane_widths_agree(device, some_scene, spp, outputs=(), **settings):
             np.testing.assert_allclose(wide.aovs[name], pixels, rtol=1e-5, atol=1e-7, err_msg=name)
 
 
-@pytest.mark.parametrize("columns", [12, 6], ids=["tree", "list"])
+@pytest.mark.parametrize(
+    "columns",
+    [pytest.param(12, marks=pytest.mark.slow, id="tree"), pytest.param(6, id="list")],
+)
 def test_lane_widths_agree(device, columns):
     assert_lane_widths_agree(device, scene(columns=columns), 40, OUTPUTS)
 

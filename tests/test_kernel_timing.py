@@ -322,6 +322,7 @@ def test_an_unknown_field_of_a_path_is_refused():
         path_fields("betta")
 
 
+@pytest.mark.slow
 def test_the_full_build_has_every_feature_and_the_same_image(device):
     images = []
     for full in (False, True):

@@ -89,7 +89,7 @@ def test_filter_that_stays_as_it_is_leaves_nothing_to_restore():
     assert preset_values("psf")["filter_restore"] is True
 
 
-@pytest.mark.parametrize("spp", [12, 40])
+@pytest.mark.parametrize("spp", [12, pytest.param(40, marks=pytest.mark.slow)])
 def test_the_picture_equals_a_model_in_numpy(lane_device, spp):
     opened = renderer(lane_device, room(SIZE), **RESTORE, cell_size=16.0)
     opened.render(spp=spp)
