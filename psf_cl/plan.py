@@ -346,33 +346,12 @@ def make_plan(
         if image is not None and features["ENVIRONMENT"].value == 2
         else 0,
     )
-    stages = []
-    for module in (
-        animate,
-        photons,
-        virtual_lights,
-        camera,
-        metropolis,
-        intersect,
-        shade,
-        connect,
-        cells,
-        cell_history,
-        range_search,
-        splats,
-        seen,
-        film,
-        probes,
-        temporal,
-        screen,
-        guide,
-        cache,
-        material_cells,
-        restore,
-    ):
-        stage = module.plan(context)
-        if stage is not None:
-            stages.append(stage)
+    stages = _stages(context)
+    if settings.integrator == "path" and any(stage.between_passes for stage in stages):
+        traits = _draining(traits, pixel_count)
+        ring = _ring(pixel_count, traits, features, RING_BYTES >> halvings)
+        context = dataclasses.replace(context, traits=traits, ring=ring)
+        stages = _stages(context)
     left_out = [
         (name.lower(), feature.reason) for name, feature in features.items() if not feature.value
     ]
@@ -383,7 +362,7 @@ def make_plan(
         left_out.append(("slots", f"of large hash tables {part} is there: too little room"))
     plan = Plan(
         features,
-        tuple(stages),
+        stages,
         tuple(left_out),
         _scene_buffers(context, scene),
         outputs,
@@ -417,6 +396,41 @@ def _smaller(traits: DeviceTraits, halvings: int) -> DeviceTraits:
     """Return ``traits`` with a pool that was halved so often, down to MIN_SLOTS."""
     slots = max(traits.slots >> halvings, min(MIN_SLOTS, traits.slots))
     return dataclasses.replace(traits, slots=slots - slots % traits.block)
+
+
+def _draining(traits: DeviceTraits, pixel_count: int) -> DeviceTraits:
+    """Return ``traits`` with a pool that drains between passes of so many pixels."""
+    slots = min(max(int(traits.epoch_share * pixel_count), MIN_SLOTS), traits.slots)
+    return dataclasses.replace(traits, slots=slots - slots % traits.block)
+
+
+def _stages(context: Context) -> tuple[StageSpec, ...]:
+    """Return the stages that are not left out, in the order in which they are shown."""
+    modules = (
+        animate,
+        photons,
+        virtual_lights,
+        camera,
+        metropolis,
+        intersect,
+        shade,
+        connect,
+        cells,
+        cell_history,
+        range_search,
+        splats,
+        seen,
+        film,
+        probes,
+        temporal,
+        screen,
+        guide,
+        cache,
+        material_cells,
+        restore,
+    )
+    planned = (module.plan(context) for module in modules)
+    return tuple(stage for stage in planned if stage is not None)
 
 
 def _building(context: Context) -> tuple[BufferSpec, ...]:

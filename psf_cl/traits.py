@@ -17,6 +17,7 @@ class DeviceTraits:
         group: work items of a work group.
         run: blocks of lanes that a work item takes one after the other where items would otherwise
             meet at a counter all the time.
+        epoch_share: part of a pass that is in flight at most where the pool drains between passes.
         few_triangles, few_corners, few_plates: scenes up to this size are traced without a tree,
             all triangles in lanes, or the plates that they make; 0 for never.
     """
@@ -27,6 +28,7 @@ class DeviceTraits:
     slots: int
     group: int
     run: int = 1
+    epoch_share: float = 1.0
     few_triangles: int = 0
     few_corners: int = 0
     few_plates: int = 0
@@ -48,9 +50,11 @@ class DeviceTraits:
         looked at corner by corner, 0.4 of that of a tree at 36, about as much at 200.  With
         registers of 8 floats (AVX2), 8 lanes in blocks of 8 take 0.81 to 0.88 of the time of 16 in
         the Cornell box and 0.96 to 1.04 in larger rooms; 8k slots take less at 256x256 (0.75) but
-        more at 1024x1024 (0.98), and in large scenes.  To measure again, ``python
-        tools/kernel_timing.py SCENE --save a.json``, change the row, ``--baseline a.json``; for
-        cornell_box, ajar_door, glossy and a large scene of one's own.
+        more at 1024x1024 (0.98), and in large scenes.  Where the pool drains between passes, an
+        eighth of a pass in flight takes 0.80 to 1.03 of the time of 32k slots at 256x256 (learned,
+        photon, game), 0.95 to 1.05 at 128x128.  To measure again, ``python tools/kernel_timing.py
+        SCENE --save a.json``, change the row, ``--baseline a.json``; for cornell_box, ajar_door,
+        glossy and a large scene of one's own.
 
         GPU: not measured; a path a work item, blocks of 32 so that neighbours read neighbouring
         words.
@@ -64,6 +68,7 @@ class DeviceTraits:
                 slots=1 << 15,
                 group=8,
                 run=4,
+                epoch_share=0.125,
                 few_triangles=160,
                 few_corners=128,
                 few_plates=80,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,8 +29,12 @@ from psf_cl.image import AOVS
 from psf_cl.plan import make_plan
 from psf_cl.renderer import Renderer
 from psf_cl.scene import primitives, transform
+from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Environment, Light, Material, Texture
 from psf_cl.settings import Settings
+from psf_cl.traits import DeviceTraits
+
+ROOT = Path(__file__).resolve().parents[1]
 
 LEVELS = Texture("levels", np.full((2, 2, 4), 128, np.uint8))
 LIFTED = transform.translation((0, 0.5, 0)) @ transform.scaling(0.3)
@@ -351,6 +356,25 @@ def test_stages_declare_the_flags_that_their_sources_read():
         # One that nothing reads would build the same program anew.
         text = re.sub(r"#ifndef \w+", "", assemble(stage.source))
         assert set(stage.flags) <= flags_read(text, plan.features), stage.name
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "settings", "slots"),
+    [
+        ("cpu", (256, 256), Settings(), 1 << 15),
+        ("cpu", (256, 256), Settings(integrator="metropolis", chains=1 << 15), 1 << 15),
+        ("cpu", (256, 256), Settings(path_filter="hash_grid"), 1 << 15),
+        ("cpu", (256, 256), Settings(guiding="learned"), 1 << 13),
+        ("cpu", (100, 100), Settings(guiding="learned"), 1 << 12),
+        ("cpu", (1000, 1000), Settings(guiding="learned"), 1 << 15),
+        ("gpu", (256, 256), Settings(guiding="learned"), 1 << 16),
+        ("gpu", (256, 256), Settings(), 1 << 18),
+    ],
+)
+def test_a_pool_that_drains_between_passes_is_a_part_of_one(kind, size, settings, slots):
+    scene = load_scene(ROOT / "scenes" / "cornell_box.toml", size=size)
+    plan = make_plan(scene, settings, traits=DeviceTraits.of_kind(kind))
+    assert plan.traits.slots == slots
 
 
 def test_unused_materials_and_black_lights_bring_nothing():
