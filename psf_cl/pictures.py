@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from psf_cl.device import layout
+from psf_cl.features import restores
 from psf_cl.image import Image
-from psf_cl.plan import restores
 from psf_cl.stages import cells, film, guide, photons, restore
 
 if TYPE_CHECKING:

@@ -30,13 +30,14 @@ from psf_cl.device.program import Launch, Program
 from psf_cl.device.sources import source_digest
 from psf_cl.device.two_levels import build_two_levels
 from psf_cl.errors import DeviceError, InputError, NoRoomError
+from psf_cl.features import whole_kinds
 from psf_cl.few import NO_PLATES, Few, Plates, list_of
 from psf_cl.image import Image
 from psf_cl.instancing import Placed, place
 from psf_cl.measure.errors import error_of_halves
 from psf_cl.mover import Mover
 from psf_cl.pictures import image_of
-from psf_cl.plan import Plan, Room, make_plan, whole_kinds
+from psf_cl.plan import Plan, Room, make_plan
 from psf_cl.scene import animation
 from psf_cl.scene.digest import scene_digest
 from psf_cl.scene.far import far_from_origin, moved

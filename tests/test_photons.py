@@ -14,7 +14,8 @@ from test_light_tree import check_against_table, many_kinds
 
 from psf_cl.device import layout
 from psf_cl.errors import InputError
-from psf_cl.plan import MANY_LIGHTS, make_plan
+from psf_cl.features import MANY_LIGHTS
+from psf_cl.plan import make_plan
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Light, Mesh

@@ -23,6 +23,7 @@ ROWS = [
     {"scene", "measure"},
     {"device"},
     {"stages", "few", "tables", "whole_lights", "instancing", "motion", "mover"},
+    {"features"},
     {"chains", "plan", "scheduler", "soundness", "checkpoint", "learned"},
     {"renderer", "pictures", "stats"},
     {"cli"},

@@ -132,9 +132,7 @@ def run_self_test(
         ("in one buffer", device.max_mem_alloc_size, LEAST_BYTES // 4),
     ):
         if size < least:
-            return SelfTest(
-                f"too little memory {what}: {size >> 20} MiB, {least >> 20} are needed"
-            )
+            return SelfTest(f"too little memory {what}: {size >> 20} MiB, {least >> 20} are needed")
     count = 1000
     group_count = -(-count // _GROUP)
     # Near 1 the square needs more bits than a float has: only a fused x * x - 1 is right there.
