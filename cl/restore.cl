@@ -7,8 +7,8 @@
 // path tracing.
 //
 // Where a rare bright sample is missing all looks darker than its cell, and sure: without care its light
-// would be taken from there, and not be given to where it is, for there is noise.  So the noise around counts
-// too, and nothing becomes negative.
+// would be taken from there, and not be given to where it is, for there is noise.  So no pixel counts as surer
+// than what is around, relative to its light, and nothing becomes negative.
 //
 // James, Stein: Estimation with Quadratic Loss, 1961 (shrinking by the part that is noise).
 
@@ -24,11 +24,22 @@ static inline Vec3 gather_lost(__global const Lost *lost, UInt pixel)
 /// Part of a mean that is not noise, of the square of its luminance and what of it counts as noise.
 static inline Float sure_part(Float square, Float noise)
 {
-    return max(square - noise, (Float)(0.0f)) / max(square, (Float)(1e-37f));
+    // Not a maximum: where both are infinite their difference is no number.
+    return pick(noise < square, square - noise, (Float)(0.0f)) / max(square, (Float)(1e-37f));
 }
 
 // Of the mean noise of the first window, the part that is the least of each pixel.
 #define LEAST_NOISE 0.125f
+
+// Tiles to each side whose noise is looked at.
+#define TILES_AROUND 2u
+
+/// Luminance of a pixel of the picture; what is negative has none.
+static inline float light_of(__global const float *restored, uint pixel)
+{
+    const float3 rgb = vload3(0, restored + 4u * pixel);
+    return max(LUMINANCE_RED * rgb.x + LUMINANCE_GREEN * rgb.y + LUMINANCE_BLUE * rgb.z, 0.0f);
+}
 
 /// `back`, but no more of it than leaves a pixel that is not negative so.
 static inline float kept_positive(float back, float restored) { return max(back, -max(restored, 0.0f)); }
@@ -76,6 +87,75 @@ kernel void take_lost(
     const float difference = apart / count - tilt * mean;
     const float variance = difference * difference / max(1.0f - tilt * tilt, 1e-6f);
     unrestored[pixel].difference = caution * variance * (1.0f + 4.0f / max(count - 1.0f, 1.0f));
+}
+
+/// Add up the noise of a tile of the crop, and the square of its light: of its mean luminance, for each pixel.
+/// One work item a tile.
+///
+/// reads   unrestored, restored
+/// writes  tiles
+kernel void sum_tiles(
+    __global const Params *params,
+    __global const Lost *unrestored,
+    __global const float *restored,
+    __global float *tiles)
+{
+    const uint tile = get_global_id(0);
+    const uint across = (params->crop_width + RESTORE_TILE - 1u) / RESTORE_TILE;
+    const uint down = (params->crop_height + RESTORE_TILE - 1u) / RESTORE_TILE;
+    if (tile >= across * down)
+        return;
+    const uint left = tile % across * RESTORE_TILE;
+    const uint top = tile / across * RESTORE_TILE;
+    const uint right = min(left + RESTORE_TILE, params->crop_width);
+    const uint bottom = min(top + RESTORE_TILE, params->crop_height);
+    float noise = 0.0f;
+    float light = 0.0f;
+    for (uint y = top; y < bottom; ++y)
+        for (uint x = left; x < right; ++x) {
+            const uint pixel = pixel_entry_of(params, x, y);
+            noise += unrestored[pixel].difference;
+            light += light_of(restored, pixel);
+        }
+    tiles[2u * tile] = noise;
+    tiles[2u * tile + 1u] = light / (float)((right - left) * (bottom - top)) * light;
+}
+
+/// Lift the noise of pixels that look surer, for their light, than the tiles around.  One work item a tile.
+///
+/// reads   tiles, restored
+/// writes  unrestored
+kernel void lift_noise(
+    __global const Params *params,
+    __global const float *tiles,
+    __global const float *restored,
+    __global Lost *unrestored)
+{
+    const uint tile = get_global_id(0);
+    const uint across = (params->crop_width + RESTORE_TILE - 1u) / RESTORE_TILE;
+    const uint down = (params->crop_height + RESTORE_TILE - 1u) / RESTORE_TILE;
+    if (tile >= across * down)
+        return;
+    const uint column = tile % across;
+    const uint row = tile / across;
+    float noise = 0.0f;
+    float light = 0.0f;
+    for (uint y = row - min(row, TILES_AROUND); y <= min(row + TILES_AROUND, down - 1u); ++y)
+        for (uint x = column - min(column, TILES_AROUND); x <= min(column + TILES_AROUND, across - 1u); ++x) {
+            noise += tiles[2u * (y * across + x)];
+            light += tiles[2u * (y * across + x) + 1u];
+        }
+    // Where squares leave the range of numbers nothing is known: what is infinite passes for all noise.
+    const float relative = isfinite(noise) && isfinite(light) ? noise / max(light, 1e-37f) : FLT_MAX;
+    const uint right = min((column + 1u) * RESTORE_TILE, params->crop_width);
+    const uint bottom = min((row + 1u) * RESTORE_TILE, params->crop_height);
+    for (uint y = row * RESTORE_TILE; y < bottom; ++y)
+        for (uint x = column * RESTORE_TILE; x < right; ++x) {
+            const uint pixel = pixel_entry_of(params, x, y);
+            const float its_light = light_of(restored, pixel);
+            __global Lost *left = &unrestored[pixel];
+            left->difference = max(left->difference, relative * its_light * its_light);
+        }
 }
 
 /// Sum over the pixels of a row, or `down` a column, at most `radius` away; return the sum of variances.

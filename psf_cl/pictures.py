@@ -153,7 +153,7 @@ def _restored(renderer: Renderer, counters: np.ndarray) -> np.ndarray:
     tilt = restore.tilt(passes, renderer.settings.splits)
     take.set(tilt=tilt, caution=restore.caution(passes))
     take(pixels, film.GROUP)
-    for step in (*restore.radii(passes), "pixels"):
+    for step in ("tiles", *restore.radii(passes), "pixels"):
         for launch, items in renderer.restore_launches[step]:
             launch(items, film.GROUP)
     return _in_rows(

@@ -1144,8 +1144,10 @@ class Renderer:
         self.restore_launches: dict[str | int, list[tuple[Launch, int]]] = {}
         if program is None:
             return
-        names = ("params", "film", "film_lost", "unrestored", "rows", "restored")
-        params, sums, lost, unrestored, rows, restored = (self.buffers[name] for name in names)
+        names = ("params", "film", "film_lost", "unrestored", "tiles", "rows", "restored")
+        params, sums, lost, unrestored, tiles, rows, restored = (
+            self.buffers[name] for name in names
+        )
         pixels = self.plan.pixel_count
         items = -(-pixels // self.plan.traits.lanes)
         state = {"params": params, "unrestored": unrestored}
@@ -1159,6 +1161,11 @@ class Renderer:
             **state,
         )
         self.restore_launches["take"] = [(take, pixels)]
+        tile_count = restore.tiles(self.plan.crop[2:])
+        self.restore_launches["tiles"] = [
+            (program.bind(name, tiles=tiles, restored=restored, **state), tile_count)
+            for name in ("sum_tiles", "lift_noise")
+        ]
         for radius in restore.RADII:
             add_up = program.bind("sum_rows", rows=rows, radius=radius, **state)
             add = program.bind(

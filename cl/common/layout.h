@@ -55,6 +55,7 @@
 #define STATUS_WAITING 0x40000000u // it holds a sample whose pass may not start yet
 #define STATUS_ALIVE 0x80000000u // it traces a ray
 #define STATUS_DONE 0xC0000000u // the path ended, the film does not have it yet
+#define RESTORE_TILE 16u // edge of the tiles whose noise filter_restore compares, pixels
 #define STATUS_MASK 0xC0000000u
 #define DEPTH_MASK 0x3FFFFFFFu // bounces so far
 #define FILTER_AUTO 0u // the first vertex that a wide lobe reached, over more than a cell

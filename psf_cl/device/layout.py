@@ -1108,6 +1108,7 @@ CONSTANTS = (
     ("STATUS_WAITING", 0x40000000, "it holds a sample whose pass may not start yet"),
     ("STATUS_ALIVE", 0x80000000, "it traces a ray"),
     ("STATUS_DONE", 0xC0000000, "the path ended, the film does not have it yet"),
+    ("RESTORE_TILE", 16, "edge of the tiles whose noise filter_restore compares, pixels"),
     ("STATUS_MASK", 0xC0000000, ""),
     ("DEPTH_MASK", 0x3FFFFFFF, "bounces so far"),
     ("FILTER_AUTO", 0, "the first vertex that a wide lobe reached, over more than a cell"),

@@ -40,17 +40,26 @@ def tilt(passes: int, splits: int = 1) -> float:
     return float(1.0 - 2.0 * ((numbers >> run) & 1).mean())
 
 
+def tiles(size: tuple[int, int]) -> int:
+    """Return the tiles of a picture of so many pixels across and down."""
+    edge = layout.CONSTANT["RESTORE_TILE"]
+    return -(-size[0] // edge) * -(-size[1] // edge)
+
+
 def plan(context: Context) -> StageSpec | None:
     """Return the stage, or None if nothing is put back."""
     if not context.on("RESTORE"):
         return None
     pixels, lost = context.pixel_count, layout.LOST.dtype
+    count = tiles(context.crop_size)
     return StageSpec(
         "restore",
         "what averages lost is added back before the picture is handed out",
         "restore.cl",
         kernels=(
             KernelSpec("take_lost", lanes=False),
+            KernelSpec("sum_tiles", lanes=False),
+            KernelSpec("lift_noise", lanes=False),
             KernelSpec("sum_rows"),
             KernelSpec("restore_windows"),
             KernelSpec("restore_pixels"),
@@ -60,6 +69,7 @@ def plan(context: Context) -> StageSpec | None:
                 "film_lost", lost, 2 * pixels, "what averages took from the pixels, and excess"
             ),
             BufferSpec("unrestored", lost, pixels, "of that, what is not put back yet", True),
+            BufferSpec("tiles", np.dtype(np.float32), 2 * count, "their noise and light", True),
             BufferSpec("rows", lost, pixels, "the same, summed over rows", True),
             BufferSpec("restored", np.dtype(np.float32), 4 * pixels, "the picture with it", True),
         ),
