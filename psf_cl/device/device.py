@@ -385,7 +385,9 @@ def open_device(
             found = SelfTest(str(error))
         if found.reason is None:
             kind = "cpu" if device.type & cl.device_type.CPU else "gpu"
-            traits = traits or DeviceTraits.of_kind(kind, found.register_floats)
+            # Drivers say a width too, but PoCL's may be that of the machine it was built on.
+            floats = found.register_floats or device.native_vector_width_float
+            traits = traits or DeviceTraits.of_kind(kind, floats)
             return Device(context, traits, profiling)
         failures.append(f"{device.platform.name}: {found.reason}")
     raise DeviceError(

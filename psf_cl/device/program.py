@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,8 @@ _WARM_UP_BYTES = 4096
 # No warnings: they would stand between the renderer's own lines, and compilers for CPUs whose
 # registers hold less than 16 floats warn of every function that takes vectors of 16.
 _BUILD_OPTIONS = ("-cl-std=CL1.2", "-cl-kernel-arg-info", "-w")
+# Some compilers say something even so, as Intel's that it has begun.
+warnings.filterwarnings("ignore", category=cl.CompilerWarning)
 
 
 def assemble(file: str, folder: Path | None = None) -> str:
