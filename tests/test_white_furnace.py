@@ -56,15 +56,6 @@ def furnace(device, records, wo, count=512, rounds=8):
     return np.mean(means, axis=0), np.std(means, axis=0, ddof=1) / np.sqrt(rounds)
 
 
-#: What may be lost where the table of two widths and two angles is coarse.
-LOST = {
-    "stretched metal": 0.015,
-    "most stretched metal": 0.015,
-    "stretched dielectric": 0.015,
-    "stretched sheet": 0.015,
-}
-
-
 @pytest.mark.parametrize("iors", [(1.1, 1.5, 2.4), pytest.param(IORS, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", KINDS)
 def test_white_conserves(device, kind, iors):
@@ -75,7 +66,7 @@ def test_white_conserves(device, kind, iors):
     returned, deviation = furnace(device, records, wo)
     over = returned - 1.001 - 5 * deviation
     assert over.max() < 0, (cases[over.argmax()], returned[over.argmax()])
-    under = 1 - LOST.get(kind, 0.01) - returned - 5 * deviation
+    under = 0.99 - returned - 5 * deviation
     assert under.max() < 0, (cases[under.argmax()], returned[under.argmax()])
 
 
@@ -93,7 +84,7 @@ def grid_records(count):
         "coat_roughness": (0.0, 0.3, 0.6, 1.0),
         "sheen": (BLACK, (0.5,) * 3, WHITE),
         "sheen_roughness": (0.3, 0.5, 0.7, 1.0),
-        "anisotropy": (0.0, 0.0, 0.3, 0.6, 1.0),
+        "anisotropy": (0.0, 0.0, 0.1, 0.3, 0.6, 1.0),
     }
     made = []
     for _ in range(count):
@@ -115,9 +106,7 @@ def test_no_combination_gains_or_loses_energy(device, count):
     returned, deviation = furnace(device, records, wo)
     over = returned - 1.001 - 5 * deviation
     assert over.max() < 0, (made[over.argmax()], cosines[over.argmax()], returned[over.argmax()])
-    glass = np.array([row["transmission"] == 1 and not row["thin"] for row in made])
-    stretched = np.array([row["anisotropy"] > 0 for row in made]) & ~glass
-    under = 1 - np.where(stretched, 0.015, 0.01) - returned - 5 * deviation
+    under = 0.99 - returned - 5 * deviation
     assert under.max() < 0, (
         made[under.argmax()],
         cosines[under.argmax()],

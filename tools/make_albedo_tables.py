@@ -276,7 +276,7 @@ def table(shape: tuple[int, ...], place: Array, values: Array, tolerance: Array)
     """Return the entries, ``(entries,)``, between which interpolation meets ``values``.
 
     The largest error, in units of ``tolerance``, is made small, and no value is missed from below
-    by more than SLACK.
+    by more than SLACK of it.
 
     Args:
         place: ``(n, axes)`` in [0, 1].
@@ -300,7 +300,7 @@ def table(shape: tuple[int, ...], place: Array, values: Array, tolerance: Array)
         entries += 1.5 * spread(error * pull) / np.maximum(spread(pull / tolerance), 1e-12)
         entries = np.maximum(entries, 0.0)
     for _ in range(60):
-        lacking = values - SLACK * values - (entries[corner] * weight).sum(axis=1)
+        lacking = values - SLACK * tolerance - (entries[corner] * weight).sum(axis=1)
         wanted = np.where(lacking > 0.0, lacking / (weight**2).sum(axis=1), 0.0)[:, None] * weight
         raised = np.zeros_like(entries)
         np.maximum.at(raised, corner, wanted)
@@ -308,7 +308,14 @@ def table(shape: tuple[int, ...], place: Array, values: Array, tolerance: Array)
     return entries
 
 
-STRETCHED_SHAPE = (12, 7, 10, 10)
+#: Axes of what white ones reflect: how far facets turn away, along which of them, wide and narrow
+#: width; and powers by which these are spread.
+STRETCHED_SHAPE = (15, 7, 10, 8)
+STRETCHED_POWERS = (0.75, 0.8, 1.0, 1.0)
+
+#: The same of their edge: the direction's cosine, the width seen along it, wide and narrow width.
+STRETCHED_EDGE_SHAPE = (12, 9, 9, 8)
+STRETCHED_EDGE_POWERS = (0.75, 1.0, 0.5, 0.5)
 
 #: Largest cosine at which stretched facets seem to be met, over the direction's cosine and width.
 STRETCHED_MET = 5.0
@@ -317,19 +324,50 @@ STRETCHED_MET = 5.0
 TRIALS = 150_000
 
 
-def stretched_at(place: Array) -> tuple[Array, Array, Array, Array]:
-    """Return cosine, turn and alphas of places in that of stretched highlights, ``(n, 4)``.
+def whites_at(place: Array) -> tuple[Array, Array, Array, Array]:
+    """Return cosine, turn and alphas of places in the table of white stretched ones, ``(n, 4)``.
+
+    Alphas times the direction's slopes, and the wide alpha, are all that counts where the narrow
+    one is small: in their measure its zero is no edge.
+    """
+    t, along, high, ratio = (place ** (1.0 / np.array(STRETCHED_POWERS))).T
+    high = np.maximum(high, ALPHA_MIN * (1.0 + 1e-4))
+    low = np.clip(high * ratio, ALPHA_MIN, high / (1.0 + 1e-4))
+    turned = 1.0 / np.maximum(t, 1e-5) - 1.0
+    x, y = np.sqrt(along) / high, np.sqrt(1.0 - along) / low
+    slope = np.minimum(turned * np.hypot(x, y), 1e4)
+    return 1.0 / np.hypot(1.0, slope), np.arctan2(y, x), high, low
+
+
+def place_of_whites(cosine: Array, turn: Array, high: Array, low: Array) -> Array:
+    """Return places in the table of white stretched ones, ``(n, 4)``, the inverse of whites_at."""
+    slope = np.sqrt(1.0 - cosine**2) / cosine
+    x2, y2 = (high * np.cos(turn) * slope) ** 2, (low * np.sin(turn) * slope) ** 2
+    along = x2 / np.maximum(x2 + y2, 1e-30)
+    place = np.column_stack([1.0 / (1.0 + np.sqrt(x2 + y2)), along, high, low / high])
+    return place ** np.array(STRETCHED_POWERS)
+
+
+def edges_at(place: Array) -> tuple[Array, Array, Array, Array]:
+    """Return cosine, turn and alphas of places in the table of stretched edges, ``(n, 4)``.
 
     The cosine goes by its ratio to the width that is seen along the direction, which goes by its
-    logarithm between the two alphas.
+    fourth root between the two alphas.
     """
-    t, along, roughness, stretch = place.T
-    low = np.maximum(roughness**2, ALPHA_MIN)
-    high = low + np.maximum((1.0 - low) * stretch**2, 1e-4 * low)
-    width = low * (high / low) ** along
+    t, along, high, ratio = (place ** (1.0 / np.array(STRETCHED_EDGE_POWERS))).T
+    high = np.maximum(high, ALPHA_MIN * (1.0 + 1e-4))
+    low = np.clip(high * ratio, ALPHA_MIN, high / (1.0 + 1e-4))
+    width = (low**0.25 + along * (high**0.25 - low**0.25)) ** 4
     turn = np.arccos(np.sqrt(np.clip((width**2 - low**2) / (high**2 - low**2), 0.0, 1.0)))
-    cosine = width * ((1.0 + 1.0 / width) ** (t * t) - 1.0)
-    return np.clip(cosine, 1e-4, 1.0), turn, high, low
+    return np.clip(t * width / (1.0 + width - t), 1e-4, 1.0), turn, high, low
+
+
+def place_of_edges(cosine: Array, turn: Array, high: Array, low: Array) -> Array:
+    """Return places in the table of stretched edges, ``(n, 4)``, the inverse of edges_at."""
+    width = np.clip(np.hypot(high * np.cos(turn), low * np.sin(turn)), low, high)
+    along = (width**0.25 - low**0.25) / (high**0.25 - low**0.25)
+    place = np.column_stack([cosine * (1.0 + width) / (cosine + width), along, high, low / high])
+    return place ** np.array(STRETCHED_EDGE_POWERS)
 
 
 def trials(shape: tuple[int, ...]) -> Array:
@@ -355,19 +393,25 @@ class Table:
 
 def tables_of_stretched() -> list[Table]:
     """Return the tables of stretched highlights."""
-    shape = STRETCHED_SHAPE
-    place = trials(shape)
-    cosine, turn, high, low = stretched_at(place)
-    white, edge = reflected(cosine, turn, high, low).T
+    shape = STRETCHED_EDGE_SHAPE
+    of_edges = np.array(edges_at(trials(shape)))
+    # Sharp lobes have few places of their own there.
+    facets = np.concatenate([of_edges, whites_at(trials(STRETCHED_SHAPE))], axis=1)
+    white, edge = reflected(*facets).T
+    mirror = table(STRETCHED_SHAPE, place_of_whites(*facets), white, white)
+
+    cosine, turn, high, low = of_edges
+    place = place_of_edges(cosine, turn, high, low)
+    white, edge = white[: len(place)], edge[: len(place)]
     # The edge by the cosine at which all facets seem to be met: its fifth power changes too fast.
     unit = cosine + np.hypot(high * np.cos(turn), low * np.sin(turn))
     met = 1.0 - np.clip(edge / white, 0.0, 1.0) ** 0.2
-    tolerance = 1.0 / (5.0 * white * (1.0 - met) ** 4 * unit + 0.02)
+    tolerance = 1.0 / (5.0 * white * (1.0 - met) ** 4 * unit * STRETCHED_MET + 0.02)
     rim = table(shape, place, 1.0 - met / unit / STRETCHED_MET, tolerance)
-    what = "What a white stretched mirror reflects"
+    what = "Of its edge: 1 - cosine of facets / STRETCHED_MET"
     return [
-        Table("STRETCHED", what, shape, table(shape, place, white, white)),
-        Table("STRETCHED_EDGE", "Of its edge: 1 - cosine of facets / STRETCHED_MET", shape, rim),
+        Table("STRETCHED", "What a white stretched mirror reflects", STRETCHED_SHAPE, mirror),
+        Table("STRETCHED_EDGE", what, shape, rim),
     ]
 
 
@@ -431,6 +475,7 @@ def header() -> str:
     lines += [f"#define SHEEN_ROUGHNESSES {sheen.coefficients.shape[1]}"]
     lines += [f"#define STRETCHED_MET {STRETCHED_MET:.1f}f"]
     lines += [shape_of("STRETCHED", STRETCHED_SHAPE)]
+    lines += [shape_of("STRETCHED_EDGE", STRETCHED_EDGE_SHAPE)]
     lines += text_of_fit(sheen)
     for made in tables_of_stretched():
         lines += text_of_table(made)

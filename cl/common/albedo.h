@@ -152,16 +152,27 @@ static inline Reflected reflected_by_stretched(Mask stretched, Float alpha_x, Fl
     const Float x = alpha_x * wo.x;
     const Float y = alpha_y * wo.y;
     const Float width = clamp(sqrt((x * x + y * y) / max(wo.x * wo.x + wo.y * wo.y, 1e-12f)), low, high);
-    const Float places[4] = {
-        sqrt(native_log2(1.0f + wo.z / width) / native_log2(1.0f + 1.0f / width)),
-        native_log2(width / low) / native_log2(high / low),
-        sqrt(low),
-        sqrt((high - low) / (1.0f - low)),
+    // place_of_whites and place_of_edges in tools/make_albedo_tables.py.
+    const Float ratio = low / high;
+    const Float along = pick(alpha_x >= alpha_y, x * x, y * y) / max(x * x + y * y, 1e-30f);
+    const Float turned = sqrt(x * x + y * y) / max(wo.z, 1e-12f);
+    const Float whites[4] = {
+        native_exp2(-0.75f * native_log2(1.0f + turned)),
+        native_exp2(0.8f * native_log2(max(along, 1e-12f))),
+        high,
+        ratio,
+    };
+    const Float least = sqrt(sqrt(low));
+    const Float edges[4] = {
+        native_exp2(0.75f * native_log2(max(wo.z * (1.0f + width) / (wo.z + width), 1e-12f))),
+        (sqrt(sqrt(width)) - least) / (sqrt(sqrt(high)) - least),
+        sqrt(high),
+        sqrt(ratio),
     };
     Reflected r;
-    r.white = max(look_up(stretched, STRETCHED_TABLE, STRETCHED_SHAPE, 4, places), 0.25f);
+    r.white = max(look_up(stretched, STRETCHED_TABLE, STRETCHED_SHAPE, 4, whites), 0.25f);
     // Of the edge the table has the cosine at which all facets together seem to be met.
-    const Float met = 1.0f - look_up(stretched, STRETCHED_EDGE_TABLE, STRETCHED_SHAPE, 4, places);
+    const Float met = 1.0f - look_up(stretched, STRETCHED_EDGE_TABLE, STRETCHED_EDGE_SHAPE, 4, edges);
     r.edge = r.white * fifth_power_of_one_minus(met * STRETCHED_MET * (wo.z + width));
     r.white = pick(stretched, r.white, round.white);
     r.edge = pick(stretched, r.edge, round.edge);
