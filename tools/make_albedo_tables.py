@@ -317,6 +317,9 @@ STRETCHED_POWERS = (0.75, 0.8, 1.0, 1.0)
 STRETCHED_EDGE_SHAPE = (12, 9, 9, 8)
 STRETCHED_EDGE_POWERS = (0.75, 1.0, 0.5, 0.5)
 
+#: Most that a table of white ones can tell: entries over 1 keep what is between them from lacking.
+STRETCHED_MOST = 1.01
+
 #: Largest cosine at which stretched facets seem to be met, over the direction's cosine and width.
 STRETCHED_MET = 5.0
 
@@ -408,9 +411,10 @@ def tables_of_stretched() -> list[Table]:
     met = 1.0 - np.clip(edge / white, 0.0, 1.0) ** 0.2
     tolerance = 1.0 / (5.0 * white * (1.0 - met) ** 4 * unit * STRETCHED_MET + 0.02)
     rim = table(shape, place, 1.0 - met / unit / STRETCHED_MET, tolerance)
+    what_white = "What a white stretched mirror reflects / STRETCHED_MOST"
     what = "Of its edge: 1 - cosine of facets / STRETCHED_MET"
     return [
-        Table("STRETCHED", "What a white stretched mirror reflects", STRETCHED_SHAPE, mirror),
+        Table("STRETCHED", what_white, STRETCHED_SHAPE, mirror / STRETCHED_MOST),
         Table("STRETCHED_EDGE", what, shape, rim),
     ]
 
@@ -473,6 +477,7 @@ def header() -> str:
     lines += [f"#define SHEEN_ROUGHNESS_MIN {SHEEN_ROUGHNESS_MIN:.1f}f"]
     lines += [f"#define SHEEN_TERMS {sheen.coefficients.shape[0]}"]
     lines += [f"#define SHEEN_ROUGHNESSES {sheen.coefficients.shape[1]}"]
+    lines += [f"#define STRETCHED_MOST {STRETCHED_MOST:.2f}f"]
     lines += [f"#define STRETCHED_MET {STRETCHED_MET:.1f}f"]
     lines += [shape_of("STRETCHED", STRETCHED_SHAPE)]
     lines += [shape_of("STRETCHED_EDGE", STRETCHED_EDGE_SHAPE)]

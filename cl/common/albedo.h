@@ -170,7 +170,8 @@ static inline Reflected reflected_by_stretched(Mask stretched, Float alpha_x, Fl
         sqrt(ratio),
     };
     Reflected r;
-    r.white = max(look_up(stretched, STRETCHED_TABLE, STRETCHED_SHAPE, 4, whites), 0.25f);
+    const Float white = STRETCHED_MOST * look_up(stretched, STRETCHED_TABLE, STRETCHED_SHAPE, 4, whites);
+    r.white = clamp(white, (Float)(0.25f), (Float)(1.0f));
     // Of the edge the table has the cosine at which all facets together seem to be met.
     const Float met = 1.0f - look_up(stretched, STRETCHED_EDGE_TABLE, STRETCHED_EDGE_SHAPE, 4, edges);
     r.edge = r.white * fifth_power_of_one_minus(met * STRETCHED_MET * (wo.z + width));
