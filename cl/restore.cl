@@ -29,7 +29,7 @@ static inline Float sure_part(Float square, Float noise)
 }
 
 // Of the mean noise of the first window, the part that is the least of each pixel.
-#define LEAST_NOISE 0.125f
+#define LEAST_NOISE 0.5f
 
 // Tiles to each side whose noise is looked at.
 #define TILES_AROUND 2u

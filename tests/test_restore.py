@@ -85,7 +85,7 @@ def model(opened, positive=True):
         back = (np.maximum(square - noise, 0) / np.maximum(square, 1e-37))[..., None] * means
         image, left = put_back(image, left, back)
         if radius == 8:
-            variance = np.maximum(variance, sums[..., 3:] / counts[..., None] / 8)
+            variance = np.maximum(variance, sums[..., 3:] / counts[..., None] / 2)
     # At the edges of the picture a neighbour that is missing is the pixel at the edge, once more.
     both = np.stack([(left @ LUMINANCE) ** 2, variance[..., 0]], axis=-1)
     padded = np.pad(both, [(1, 1), (1, 1), (0, 0)], mode="edge")
