@@ -154,7 +154,8 @@ kernel void lift_noise(
             const uint pixel = pixel_entry_of(params, x, y);
             const float its_light = light_of(restored, pixel);
             __global Lost *left = &unrestored[pixel];
-            left->difference = max(left->difference, relative * its_light * its_light);
+            // No number where nothing around has any light: fmax leaves that out.
+            left->difference = fmax(left->difference, relative * its_light * its_light);
         }
 }
 

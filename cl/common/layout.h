@@ -51,11 +51,11 @@
 #define SPHERE_COLUMNS 64u // of faces of a light that is a sphere
 #define SPHERE_ROWS 32u
 #define STRIP_ROWS 4u // rows of pixels that the queue takes column by column
+#define RESTORE_TILE 16u // edge of the tiles whose noise filter_restore compares, pixels
 #define STATUS_IDLE 0u // the slot has no path yet
 #define STATUS_WAITING 0x40000000u // it holds a sample whose pass may not start yet
 #define STATUS_ALIVE 0x80000000u // it traces a ray
 #define STATUS_DONE 0xC0000000u // the path ended, the film does not have it yet
-#define RESTORE_TILE 16u // edge of the tiles whose noise filter_restore compares, pixels
 #define STATUS_MASK 0xC0000000u
 #define DEPTH_MASK 0x3FFFFFFFu // bounces so far
 #define FILTER_AUTO 0u // the first vertex that a wide lobe reached, over more than a cell
