@@ -494,7 +494,10 @@ def on_both(device, scene, spp, outputs):
     return few, render(Device(device.context, without), scene, spp, outputs), plan
 
 
-@pytest.mark.parametrize("count", [0, 1, pytest.param(2, marks=pytest.mark.slow), 160, 161])
+@pytest.mark.parametrize(
+    "count",
+    [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow), 160, 161],
+)
 def test_a_list_and_a_tree_give_the_same_image(device, count):
     outputs = ("albedo", "normal", "depth", "direct")
     few, tree, plan = on_both(device, scene_of(count), 32, outputs)
