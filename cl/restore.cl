@@ -24,8 +24,9 @@ static inline Vec3 gather_lost(__global const Lost *lost, UInt pixel)
 /// Part of a mean that is not noise, of the square of its luminance and what of it counts as noise.
 static inline Float sure_part(Float square, Float noise)
 {
-    // Not a maximum: where both are infinite their difference is no number.
-    return pick(noise < square, square - noise, (Float)(0.0f)) / max(square, (Float)(1e-37f));
+    // Of what is infinite nothing is sure: it must not make anything that is no number.
+    const Mask sure = (noise < square) & (square < (Float)(INFINITY));
+    return pick(sure, square - noise, (Float)(0.0f)) / max(square, (Float)(1e-37f));
 }
 
 // Of the mean noise of the first window, the part that is the least of each pixel.
