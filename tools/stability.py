@@ -350,8 +350,9 @@ def changed(values: Mapping[str, Any]) -> str:
     return " ".join(f"{k}={v}" for k, v in values.items() if v != getattr(default, k))
 
 
-#: Ends of ranges that would only take hours: a row of the table has so many photons too.
-ENOUGH = {"photons": 10_000_000}
+#: Ends of ranges that would only take hours, or more memory than some devices give a buffer: a row
+#: of the table has so many photons too.
+ENOUGH = {"photons": 10_000_000, "chains": 1 << 20}
 
 
 def setting_values() -> dict[str, list[Any]]:
