@@ -35,6 +35,8 @@ static inline Float sure_part(Float square, Float noise)
 // Tiles to each side whose noise is looked at.
 #define TILES_AROUND 2u
 
+static inline uint tiles_along(uint extent) { return (extent + RESTORE_TILE - 1u) / RESTORE_TILE; }
+
 /// Luminance of a pixel of the picture; what is negative has none.
 static inline float light_of(__global const float *restored, uint pixel)
 {
@@ -102,8 +104,8 @@ kernel void sum_tiles(
     __global float *tiles)
 {
     const uint tile = get_global_id(0);
-    const uint across = (params->crop_width + RESTORE_TILE - 1u) / RESTORE_TILE;
-    const uint down = (params->crop_height + RESTORE_TILE - 1u) / RESTORE_TILE;
+    const uint across = tiles_along(params->crop_width);
+    const uint down = tiles_along(params->crop_height);
     if (tile >= across * down)
         return;
     const uint left = tile % across * RESTORE_TILE;
@@ -133,8 +135,8 @@ kernel void lift_noise(
     __global Lost *unrestored)
 {
     const uint tile = get_global_id(0);
-    const uint across = (params->crop_width + RESTORE_TILE - 1u) / RESTORE_TILE;
-    const uint down = (params->crop_height + RESTORE_TILE - 1u) / RESTORE_TILE;
+    const uint across = tiles_along(params->crop_width);
+    const uint down = tiles_along(params->crop_height);
     if (tile >= across * down)
         return;
     const uint column = tile % across;
