@@ -2,10 +2,12 @@
 
 Each round takes a random scene, preset, settings that go with it, size and budget, and renders it
 as a user would, in a process of its own: once without a stop; and once more, stopped again and
-again by kill -9, SIGTERM or SIGINT, or left alone, and resumed from its checkpoint.  A round fails
-if a process ends in a traceback or by a signal that nobody sent, a pixel is not finite, the two
-images differ in a bit, or something is left in the folder.  The round of a seed is always the same;
-``--state`` keeps the next seed and the sums, so that a soak goes on in parts.
+again by kill -9, SIGTERM or SIGINT, or left alone, and resumed from its checkpoint.  Of a scene
+that moves it renders some frames, which have no checkpoint: the next begins anew.  A round fails
+if a process ends in a traceback or by a signal that it should have handled, a pixel is not finite,
+the two images differ in a bit, a frame that was whole when the process was stopped is another one,
+or something is left in the folder.  The round of a seed is always the same; ``--state`` keeps the
+next seed and the sums, so that a soak goes on in parts.
 
 The memory of long renders is watched too: of one process that renders scene after scene.
 """
@@ -39,10 +41,19 @@ from psf_cl.scene.load import load_scene
 from psf_cl.settings import PRESETS, Settings, resolve
 
 ROOT = Path(__file__).resolve().parent.parent
-SCENES = tuple(sorted(path.name for path in (ROOT / "scenes").glob("*.toml")))
+SCENES = ROOT / "scenes"
+STILL = tuple(sorted(path.name for path in SCENES.glob("*.toml")))
+MOVING = tuple(sorted(f"moving/{path.name}" for path in (SCENES / "moving").glob("*.toml")))
+
+#: Rounds of moving scenes among all.
+MOVING_SHARE = 0.25
 
 #: A part of a render that was not stopped has to end after so many seconds.
 MOST_SECONDS = 900.0
+
+#: A process is stopped after so many seconds at the earliest, half of which it starts in, and so
+#: many more on average.
+FIRST_STOP, MEAN_STOP = 1.0, 1.5
 
 #: Numbers that a round may set a setting to: ends of ranges take too long for many rounds.
 LARGEST = 64.0
@@ -62,14 +73,16 @@ class Round:
     spp: int
     memory: int | None
     stops: tuple[tuple[str, float], ...]
+    frames: tuple[int, int] | None = None
 
     def arguments(self) -> list[str]:
         """Return what ``psf-cl render`` is told in any case."""
         width, height = self.size
         sets = [f"{key}={json.dumps(value)}".replace('"', "") for key, value in self.settings]
         memory = ["--memory", str(self.memory)] if self.memory else []
+        frames = ["--frames", "{}:{}".format(*self.frames), "--fps", "24"] if self.frames else []
         return [
-            *(f"scenes/{self.scene}", "--preset", self.preset, "--quiet", *memory),
+            *(f"scenes/{self.scene}", "--preset", self.preset, "--quiet", *memory, *frames),
             *("--size", f"{width}x{height}", "--spp", str(self.spp)),
             *(["--set", *sets] if sets else []),
         ]
@@ -78,22 +91,26 @@ class Round:
 def round_of(seed: int) -> Round:
     """Return the round of a seed."""
     chance = random.Random(seed)
-    scene, preset = chance.choice(SCENES), chance.choice(list(PRESETS))
+    moving = chance.random() < MOVING_SHARE
+    scene = chance.choice(MOVING if moving else STILL)
+    preset = chance.choice(list(PRESETS))
     settings = _settings(scene, preset, chance)
     pixels = 2 ** chance.uniform(0, 13)
     width = max(round(pixels ** chance.uniform(0.2, 0.8)), 1)
     stops = tuple(
-        (chance.choice(["KILL", "TERM", "INT"]), chance.expovariate(1.0))
+        (chance.choice(["KILL", "TERM", "INT"]), FIRST_STOP + chance.expovariate(1.0 / MEAN_STOP))
         for _ in range(chance.randrange(4))
     )
+    first = chance.randrange(12)
     return Round(
         scene,
         preset,
         settings,
         (width, max(round(pixels / width), 1)),
-        max(round(2 ** chance.uniform(0, 9)), 1),
+        max(round(2 ** chance.uniform(0, 6 if moving else 9)), 1),
         chance.choice([None, None, 64, 512]),
         stops,
+        (first, first + chance.randrange(1, 7)) if moving else None,
     )
 
 
@@ -117,38 +134,91 @@ def _settings(scene: str, preset: str, chance: random.Random) -> tuple[tuple[str
     return tuple(chosen.items())
 
 
-def run_round(now: Round, folder: Path) -> str:
-    """Run a round; return what went wrong, empty if nothing did."""
-    whole, stopped, state = folder / "whole.exr", folder / "stopped.exr", folder / "state"
+@dataclass
+class Outcome:
+    """What came of a round.
+
+    Attributes:
+        failure: what went wrong; empty if nothing did.
+        refused: whether there was too little memory for it, which was said.
+        stops: signals that a process got before it was done.
+    """
+
+    failure: str = ""
+    refused: bool = False
+    stops: int = 0
+
+
+def run_round(now: Round, folder: Path) -> Outcome:
+    """Run a round."""
+    number = "_##" if now.frames else ""
+    whole, stopped = folder / f"whole{number}.exr", folder / f"stopped{number}.exr"
+    state = folder / "state"
+    outcome = Outcome()
     code, text = _render([*now.arguments(), "-o", str(whole)])
     if code == 1 and now.memory and "MiB" in text and "Traceback" not in text:
-        return ""  # Refused, with the reason: there is too little memory for it.
+        outcome.refused = True
+        return outcome
     if code != 0:
-        return f"code {code}: {text}"
-    again = [*now.arguments(), "-o", str(stopped), "--checkpoint", str(state)]
-    again += ["--checkpoint-seconds", "0.05"]
+        outcome.failure = f"code {code}: {text}"
+        return outcome
+    again = [*now.arguments(), "-o", str(stopped)]
+    if now.frames is None:
+        again += ["--checkpoint", str(state), "--checkpoint-seconds", "0.05"]
     for name, seconds in now.stops:
-        resume = ["--resume", str(state)] if state.exists() else []
-        code, text = _render([*again, *resume], name, seconds)
-        # Too early even for the program, or at an end that it came to first.
-        if code in (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT):
-            continue
-        if code not in (0, 130) or "Traceback" in text:
-            return f"stopped by {name}: code {code}: {text}"
-    resume = ["--resume", str(state)] if state.exists() else []
-    code, text = _render([*again, *resume])
+        for path in folder.glob("stopped*") if now.frames else ():
+            path.unlink()  # The next part may come less far: which is the last would not be known.
+        before = _files(folder)
+        code, text = _render([*again, *_resume(state)], name, seconds)
+        outcome.stops += code != 0
+        # A process without a handler yet has not written anything.
+        unborn = code == -getattr(signal, f"SIG{name}") and _files(folder) == before
+        if code in (0, 130, -signal.SIGKILL) or unborn:
+            outcome.failure = _difference(now, folder, code == 0) if now.frames else ""
+        else:
+            outcome.failure = f"code {code}: {text}"
+        if "Traceback" in text:
+            outcome.failure = text
+        if outcome.failure:
+            outcome.failure = f"stopped by {name}: {outcome.failure}"
+            return outcome
+    code, text = _render([*again, *_resume(state)])
     if code != 0:
-        return f"the last part: code {code}: {text}"
-    one, other = read_exr(whole), read_exr(stopped)
-    if not np.isfinite(one.rgb).all():
-        return "a pixel is not finite"
-    if one.rgb.tobytes() != other.rgb.tobytes():
-        return "the resumed image is another one"
-    left = sorted(path.name for path in folder.iterdir() if path.name.startswith(".psf_cl"))
+        outcome.failure = f"the last part: code {code}: {text}"
+        return outcome
     # A part of an image that was being written when the process was killed stays until the next
     # render to that name.
-    if left:
-        return f"left behind: {', '.join(left)}"
+    left = sorted(path.name for path in folder.iterdir() if path.name.startswith(".psf_cl"))
+    outcome.failure = f"left behind: {', '.join(left)}" if left else _difference(now, folder, True)
+    return outcome
+
+
+def _resume(state: Path) -> list[str]:
+    return ["--resume", str(state)] if state.exists() else []
+
+
+def _files(folder: Path) -> set[tuple[str, int, int]]:
+    """Return what another file of the same name would change."""
+    stats = [(path.name, path.stat()) for path in folder.iterdir()]
+    return {(name, stat.st_ino, stat.st_mtime_ns) for name, stat in stats}
+
+
+def _difference(now: Round, folder: Path, done: bool) -> str:
+    """Compare the images that were stopped with the whole ones; return what is wrong.
+
+    Args:
+        done: whether all have to be there.  Else the last may hold fewer samples.
+    """
+    ends = [f"_{frame:02d}.exr" for frame in range(*now.frames)] if now.frames else [".exr"]
+    there = [end for end in ends if (folder / f"stopped{end}").exists()]
+    if done and there != ends:
+        return f"{len(ends) - len(there)} images are missing"
+    for end in there:
+        one, other = (read_exr(folder / f"{name}{end}").rgb for name in ("whole", "stopped"))
+        if not (np.isfinite(one).all() and np.isfinite(other).all()):
+            return f"{end}: a pixel is not finite"
+        if one.tobytes() != other.tobytes() and (done or end != there[-1]):
+            return f"{end}: stopped and whole are different images"
     return ""
 
 
@@ -157,7 +227,7 @@ def _render(arguments: list[str], stop: str = "", seconds: float = MOST_SECONDS)
     command = [sys.executable, "-m", "psf_cl", "render", *arguments]
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
         try:
-            _, text = process.communicate(timeout=seconds + 2.0 if stop else seconds)
+            _, text = process.communicate(timeout=seconds)
         except subprocess.TimeoutExpired:
             if not stop:
                 process.kill()
@@ -204,7 +274,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=1 << 60, help="rounds at most")
     parser.add_argument("--pictures", type=int, default=24, help="of the watch on memory")
     args = parser.parse_args(argv)
-    sums = {"next_seed": 0, "rounds": 0, "stops": 0, "seconds": 0.0, "failures": []}
+    sums = {"next_seed": 0, "rounds": 0, "refused": 0, "stops": 0, "seconds": 0.0, "failures": []}
     if args.state is not None and args.state.exists():
         sums |= json.loads(args.state.read_text())
     if args.seed is not None:
@@ -214,13 +284,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     while time.monotonic() - begin < args.seconds and done < args.count:
         now, done = round_of(sums["next_seed"]), done + 1
         with tempfile.TemporaryDirectory() as folder:
-            failure = run_round(now, Path(folder))
-        if failure:
-            sums["failures"].append(f"seed {sums['next_seed']}: {now}: {failure}")
+            outcome = run_round(now, Path(folder))
+        if outcome.failure:
+            sums["failures"].append(f"seed {sums['next_seed']}: {now}: {outcome.failure}")
             print(sums["failures"][-1], flush=True)
         sums["next_seed"] += 1
         sums["rounds"] += 1
-        sums["stops"] += len(now.stops)
+        sums["refused"] += outcome.refused
+        sums["stops"] += outcome.stops
         sums["seconds"] += time.monotonic() - last
         last = time.monotonic()
         if args.state is not None:
@@ -228,7 +299,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     growth = memory_growth(args.pictures) if args.pictures else 0
     flat = growth < MOST_GROWTH
     print(
-        f"{sums['rounds']} rounds, {sums['stops']} stops, {sums['seconds']:.0f} s: "
+        f"{sums['rounds']} rounds, {sums['refused']} refused for their memory, "
+        f"{sums['stops']} stops, {sums['seconds']:.0f} s: "
         f"{len(sums['failures'])} failures; memory grew by {growth / 2**20:.1f} MiB"
     )
     return int(bool(sums["failures"]) or not flat)
