@@ -444,6 +444,13 @@ kernel void shade_paths(
         store_features(params, features, first, hit, sample, pixel, b.base_color, s.ns, FIELD(path, PATH_HIT_T));
     }
 #endif
+#if TRANSMISSION
+    s.ns = normal_of_glass(s, b, wo);
+#if TANGENTS
+    tangent = tangent_across(s.ns, tangent);
+    bitangent = cross3(s.ns, tangent);
+#endif
+#endif
 
 #if AOV_LIGHTS
     if (any_lane(alive & camera_ray))

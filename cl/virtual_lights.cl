@@ -54,7 +54,7 @@ kernel void scatter_photons(
     const Float u = FIELD(path, PATH_HIT_U);
     const Float v = FIELD(path, PATH_HIT_V);
     const Vec3 wo = scale(get_v(path, PATH_DIRECTION_X), (Float)(-1.0f));
-    const SurfacePoint s = surface_point(triangle, u, v, wo, surfaces
+    SurfacePoint s = surface_point(triangle, u, v, wo, surfaces
 #if SMOOTH
                                          , normals
 #endif
@@ -94,6 +94,9 @@ kernel void scatter_photons(
         atomic_inc(&virtual_counts[lane_slot[k]]);
     }
 
+#if TRANSMISSION
+    s.ns = normal_of_glass(s, b, wo);
+#endif
     Vec3 tangent;
     Vec3 bitangent;
     make_frame(s.ns, &tangent, &bitangent);

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import bsdf_truth
 import numpy as np
 import pytest
@@ -145,6 +147,49 @@ def test_every_part_of_the_white_bowl_looks_like_its_environment(device, environ
     )
     image = render(device, scene, 16384, max_depth=100_000)
     assert_blocks_equal(image, 1.0, 0.005)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("roughness", "least"), [(0.0, 0.995), (0.3, 0.95)])
+def test_glass_is_not_dark_where_its_shading_normals_lean(device, roughness, least):
+    """A wall whose corners share their normals with its rim: all lean towards it by 40 degrees.
+
+    They would mirror light between its faces through them, where there is none.  Single facets of
+    rough glass still do.
+    """
+    box = primitives.box()
+    across, along = np.cos(np.radians(40)), np.sin(np.radians(40))
+    leaning = box.positions * [0.0, 0.0, across] + [0.0, along, 0.0]
+    wall = replace(box, positions=box.positions * np.float32([20, 20, 0.1]), normals=leaning)
+    glass = Material(base_color=(1.0, 1.0, 1.0), transmission=1.0, roughness=roughness)
+    scene = build(
+        [(wall, IDENTITY, glass)],
+        camera((0, 0, 3), (0, 0, 0), 60),
+        (16, 16),
+        environment=1.0,
+    )
+    image = render(device, scene, 256, max_depth=200, roulette_depth=200)
+    assert least < image.rgb.mean() < 1.005
+
+
+@pytest.mark.slow
+def test_sheen_finer_than_its_fit_is_taken_as_the_finest_of_it(device):
+    """Roughness 0.3; finer sheen would give back more than comes."""
+    pictures = []
+    for roughness in (0.0, 0.1, 0.3, 0.5):
+        velvet = Material(base_color=(1.0, 1.0, 1.0), sheen_color=(1, 1, 1))
+        scene = build(
+            [(primitives.sphere(), IDENTITY, replace(velvet, sheen_roughness=roughness))],
+            camera((0, 0, 2), (0, 0, 0), 30),
+            (16, 16),
+            environment=1.0,
+        )
+        pictures.append(render(device, scene, 4096, max_depth=1).rgb)
+    means = np.mean(pictures, axis=(1, 2, 3))
+    assert (means < 1.001).all() and (means > 0.99).all()
+    for picture in pictures[:2]:
+        np.testing.assert_array_equal(picture, pictures[2])
+    assert (pictures[3] != pictures[2]).any()
 
 
 # One vertex of a rough surface under a white sky: its directional albedo, against quadrature over

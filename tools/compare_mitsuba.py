@@ -28,7 +28,14 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
-from mitsuba_scene import differences, flat, lambertian, mitsuba_scene, set_variant
+from mitsuba_scene import (
+    differences,
+    flat,
+    lambertian,
+    mitsuba_scene,
+    plain,
+    set_variant,
+)
 from rich.console import Console
 from rich.table import Table
 
@@ -112,7 +119,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--spp", type=positive_integer, default=64, help="for each seed (64)")
     parser.add_argument("--seeds", type=positive_integer, default=8, help="at least 8, the default")
     parser.add_argument("--size", metavar="WxH", type=size_argument, help="instead of the scene's")
-    parser.add_argument("--lambertian", action="store_true", help="make all materials Lambertian")
+    kinds = parser.add_mutually_exclusive_group()
+    kinds.add_argument("--lambertian", action="store_true", help="make all materials Lambertian")
+    kinds.add_argument(
+        "--own-materials",
+        action="store_true",
+        help="make all materials such as Mitsuba's own plugins are, and use these",
+    )
     parser.add_argument(
         "--set",
         dest="runs",
@@ -132,13 +145,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     table.add_column("")
     passed = True
     for path in args.scenes:
-        scene = comparable(psf_cl.load_scene(path, size=args.size), args.lambertian)
+        scene = psf_cl.load_scene(path, size=args.size)
+        scene = comparable(scene, args.lambertian, args.own_materials)
         theirs: dict[tuple[int, ...], Estimate] = {}
         for run in args.runs or [[]]:
             settings = resolve(scene.render, scene.path, overrides=dict(run))
             key = (settings.max_depth,)
             if key not in theirs:
-                theirs[key] = render_mitsuba(scene, settings, args.spp, args.seeds)
+                theirs[key] = render_mitsuba(
+                    scene, settings, args.spp, args.seeds, own_materials=args.own_materials
+                )
             result = agreement(render_ours(scene, settings, args.spp, args.seeds), theirs[key])
             table.add_row(Path(path).stem, *_row(run, result))
             passed &= result.passed
@@ -146,23 +162,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0 if passed else 1
 
 
-def comparable(scene: Scene, plain: bool) -> Scene:
-    """Return the scene without shading normals, if ``plain`` with Lambertian materials too.
+def comparable(scene: Scene, matt: bool, own_materials: bool = False) -> Scene:
+    """Return the scene without shading normals, with materials that can be compared.
+
+    All are Lambertian if ``matt``, or if ``own_materials`` as ``mitsuba_scene.plain`` has them.
 
     Raises:
         InputError: something in it would not be the same in Mitsuba.
     """
-    scene = lambertian(scene) if plain else flat(scene)
+    scene = lambertian(scene) if matt else flat(plain(scene) if own_materials else scene)
     for what in differences(scene):
         raise InputError(f"{scene.path}: expected a scene without {what}")
     return scene
 
 
 def render_mitsuba(
-    scene: Scene, settings: Settings, spp: int, seeds: int, bsdf: dict[str, Any] | None = None
+    scene: Scene,
+    settings: Settings,
+    spp: int,
+    seeds: int,
+    bsdf: dict[str, Any] | None = None,
+    own_materials: bool = False,
 ) -> Estimate:
-    """Render with Mitsuba's path tracer, with independent samples; ``bsdf`` as in mitsuba_scene."""
-    built = mitsuba_scene(scene, settings.max_depth, settings.roulette_depth, bsdf=bsdf)
+    """Render with Mitsuba's path tracer, with independent samples; the rest as in mitsuba_scene."""
+    depths = settings.max_depth, settings.roulette_depth
+    built = mitsuba_scene(scene, *depths, own_materials, bsdf)
     part = min(spp, max(1, MITSUBA_SAMPLES // (scene.width * scene.height)))
     counts = [min(part, spp - first) for first in range(0, spp, part)]
     images = []

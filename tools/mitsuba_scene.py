@@ -56,6 +56,18 @@ def opaque(scene: Scene) -> Scene:
     return replace(scene, materials=tuple(replace(m, alpha_mode="opaque") for m in scene.materials))
 
 
+def plain(scene: Scene) -> Scene:
+    """Return the scene with materials that Mitsuba's own plugins have too, and without cut-outs.
+
+    That are matt ones without a coat, metals and clear glass.
+    """
+    materials = tuple(
+        m if m.metallic == 1.0 or _is_clear(m) else replace(m, specular=0.0, metallic=0.0)
+        for m in scene.materials
+    )
+    return opaque(replace(scene, materials=materials))
+
+
 def flat(scene: Scene) -> Scene:
     """Return the scene without shading normals: what they mean near the horizon is a choice."""
     shapes = tuple(replace(s, mesh=replace(s.mesh, normals=None)) for s in scene.shapes)
@@ -198,6 +210,10 @@ def _image_sky(environment: Environment) -> dict[str, Any]:
     }
 
 
+def _is_clear(material: Material) -> bool:
+    return material.metallic == 0.0 and material.transmission == material.specular == 1.0
+
+
 def _is_diffuse(material: Material) -> bool:
     return material.specular == material.metallic == material.transmission == 0.0
 
@@ -229,8 +245,7 @@ def _own_bsdf(material: Material, textures: tuple[Texture, ...]) -> dict[str, An
     color = _colour(material.base_color, material.base_color_texture, textures)
     alpha = max(material.roughness**2, SHARPEST_ALPHA)
     microfacets = {"distribution": "ggx", "alpha": alpha}
-    clear = material.metallic == 0.0 and material.transmission == material.specular == 1.0
-    if clear:
+    if _is_clear(material):
         glass = {"int_ior": material.ior, "specular_transmittance": color}
         if material.roughness > 0.0:
             glass |= {"type": "roughdielectric", **microfacets}
@@ -239,7 +254,7 @@ def _own_bsdf(material: Material, textures: tuple[Texture, ...]) -> dict[str, An
         bsdf: dict[str, Any] = glass
     elif _is_diffuse(material):
         bsdf = {"type": "diffuse", "reflectance": color}
-    elif material.metallic == 1.0:
+    elif material.metallic == 1.0 and min(material.base_color) == 1.0:
         bsdf = {"type": "roughconductor", "material": "none", "specular_reflectance": color}
         bsdf |= microfacets
     else:

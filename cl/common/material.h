@@ -61,6 +61,16 @@ static inline Vec3 placed_tangent(__global const Instance *instances, UInt insta
 }
 #endif
 
+/// The unit direction across `n` that is nearest to `t`.
+static inline Vec3 tangent_across(Vec3 n, Vec3 t)
+{
+    Vec3 any_t;
+    Vec3 any_b;
+    make_frame(n, &any_t, &any_b);
+    t = add_scaled(t, n, -dot3(t, n));
+    return normalize3(pick_v(dot3(t, t) > 1e-12f, t, any_t));
+}
+
 /// Give `s` its mapped normal, and the frame of the shading normal the direction of the tangent.
 ///
 /// What is seen from behind is mapped as from the front and then turned: a bump is a dent there.
@@ -133,11 +143,8 @@ LARGE_FUNCTION Float map_normal(
 #endif
     t = add_scaled(scale(t, x), b, y);
 #endif
-    t = add_scaled(t, mapped, -dot3(t, mapped));
-    make_frame(point->ns, &any_t, &b);
-    t = normalize3(pick_v(dot3(t, t) > 1e-12f, t, any_t));
-    *tangent = t;
-    *bitangent = cross3(point->ns, t);
+    *tangent = tangent_across(point->ns, t);
+    *bitangent = cross3(point->ns, *tangent);
     return anisotropy;
 }
 #endif
@@ -247,6 +254,22 @@ static inline Bsdf fetch_bsdf(
 }
 
 #if TRANSMISSION
+/// The normal to shade solid glass by: the real one of `s` where a smooth facet with the shading normal would send
+/// `wo`, mirrored or refracted, to the wrong side of the real surface.
+///
+/// eval_bsdf has no light there: walls of a vase whose normals are shared with its rim would be black.
+static inline Vec3 normal_of_glass(SurfacePoint s, Bsdf b, Vec3 wo)
+{
+    const Float cos_o = dot3(s.ns, wo);
+    const Float shown = dot3(s.ng, wo);
+    const Float agree = dot3(s.ng, s.ns);
+    const Float cos2_t = 1.0f - (1.0f - cos_o * cos_o) / (b.eta * b.eta);
+    const Mask mirrored_below = 2.0f * cos_o * agree <= shown;
+    const Mask refracted_above =
+        (cos2_t > 0.0f) & (agree * (cos_o / b.eta - sqrt(max(cos2_t, (Float)(0.0f)))) >= shown / b.eta);
+    return pick_v((b.transmission > 0.0f) & !b.thin & (mirrored_below | refracted_above), s.ng, s.ns);
+}
+
 /// e^x for x <= 0, to 1e-6: library calls are scalar on PoCL.
 static inline Float exp_of_negative(Float x)
 {
