@@ -218,7 +218,7 @@ def test_jobs_of_the_simulator_are_renders_that_are_not_refused(tool):
     for name, job in jobs.JOBS.items():
         settings = resolve({}, name, job.preset, jobs.SMALL | dict(job.settings))
         outputs = (jobs.OUTPUTS if job.everything else ()) + job.outputs
-        plan = make_plan(job.scene(jobs.EDGE), settings, outputs, halves=job.everything)
+        plan = make_plan(job.picture(), settings, outputs, halves=job.everything)
         assert plan.stages
         planned |= {kernel.name for stage in plan.stages for kernel in stage.kernels}
     assert planned >= {"view_guide", "scatter_photons", "settle_virtual_lights"}

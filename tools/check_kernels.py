@@ -50,7 +50,8 @@ LIBRARIES = (
     "/usr/lib/x86_64-linux-gnu/oclgrind/liboclgrind-rt-icd.so",
     "/usr/local/lib/liboclgrind-rt-icd.so",
 )
-EDGE = 4
+#: Of a picture, pixels: more than 16 lanes, and no multiple of them.
+SIZE = (5, 4)
 
 #: Settings that make presets light enough for a simulator.
 SMALL = {"max_depth": 2, "chains": 128, "photons": 64}
@@ -137,6 +138,7 @@ class Job:
         times: of the frames after the first, s.
         everything: with outputs and statistics, and a look at the first pass before its end.
         outputs: more outputs.
+        size: of the picture, if it is not to be the usual one.
     """
 
     scene: Callable[[int], Scene]
@@ -146,6 +148,12 @@ class Job:
     times: tuple[float, ...] = ()
     everything: bool = False
     outputs: tuple[str, ...] = ()
+    size: tuple[int, int] = SIZE
+
+    def picture(self) -> Scene:
+        """Return the scene with a picture of the job's size."""
+        width, height = self.size
+        return dataclasses.replace(self.scene(width), width=width, height=height)
 
 
 OUTPUTS = ("albedo", "normal", "depth", "direct", "indirect", "variance", "samples", "motion")
@@ -169,6 +177,9 @@ JOBS = {
     ),
     "outputs": Job(everything, "psf", {"filter_restore": False}, tree=False, everything=True),
     "outputs of cells": Job(room, "psf", {"cell_min_count": 4}, outputs=OUTPUTS_OF_CELLS),
+    # Several tiles of RESTORE_TILE and of PROBE_TILE, those at the edges no whole ones.
+    "tiles": Job(room, "psf", {"cell_walls": False}, size=(37, 23)),
+    "tiles of a sequence": Job(room_that_moves, "game", times=(1.0,), size=(10, 9)),
     "layers of cells": Job(
         everything, "psf", {"cell_layers": True, "cell_directions": 4}, tree=False
     ),
@@ -248,7 +259,7 @@ def render(job: Job, lanes: int) -> set[str]:
     )
     device = open_device("oclgrind", traits)
     settings = resolve({}, "a job", job.preset, SMALL | dict(job.settings))
-    scene = job.scene(EDGE)
+    scene = job.picture()
     renderer = Renderer(
         scene,
         settings,

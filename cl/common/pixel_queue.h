@@ -14,7 +14,7 @@ typedef struct {
 
 /// W pixels, one after the other or such that have waited.
 typedef struct {
-    UInt pixel; // 0 where nothing is inside
+    UInt pixel; // of the first lane where nothing is inside: no other work item writes what it has
     Mask inside;
     int waited;
 } PixelBlock;
@@ -36,13 +36,16 @@ static inline int take_block(PixelQueue *queue, PixelBlock *block)
     block->waited = queue->count >= W || queue->next >= queue->end;
     if (block->waited) {
         const uint taken = min(queue->count, (uint)W);
+        if (taken == 0u)
+            return 0;
         queue->count -= taken;
+        const uint *waiting = queue->waiting + queue->count;
         block->inside = lane < taken;
-        block->pixel = pick_u(block->inside, load_lanes_u(queue->waiting + queue->count), (UInt)(0u));
-        return taken != 0u;
+        block->pixel = pick_u(block->inside, load_lanes_u(waiting), (UInt)(waiting[0]));
+        return 1;
     }
     block->inside = lane + queue->next < queue->end;
-    block->pixel = pick_u(block->inside, lane + queue->next, (UInt)(0u));
+    block->pixel = pick_u(block->inside, lane + queue->next, (UInt)(queue->next));
     queue->next += W;
     return 1;
 }
