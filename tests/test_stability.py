@@ -172,18 +172,113 @@ def test_all_pairs_of_values_meet_in_some_row(tool):
 
 
 def test_a_table_without_a_case_or_a_column_is_not_whole(tool):
-    whole = dict.fromkeys(tool.COLUMNS, "") | {"case": "room", "preset": "pt"}
+    named = {"case": "room", "preset": "pt", "verdict": "ok", "why": ""}
+    whole = dict.fromkeys(tool.COLUMNS, 1.0) | named
     assert tool.missing_rows([whole], [("room", "pt")]) == []
     assert tool.missing_rows([whole], [("room", "pt"), ("glass", "pt")]) == ["glass with pt"]
+    empty = whole | {"of calm": ""}
     del whole["counters"]
-    assert tool.missing_rows([whole], [("room", "pt")]) == ["counters"]
+    assert tool.missing_rows([whole], [("room", "pt")]) == ["counters of room with pt"]
+    assert tool.missing_rows([empty], [("room", "pt")]) == ["of calm of room with pt"]
+
+
+#: What the table is promised to have, by the names of its cases.
+EXTREMES = """
+scaled by 0.0001, scaled by 100000, scaled by 1e-06, moved by 1000, moved by 1e+06
+1e-6 and 1e4 m together, slivers, duplicates, coplanar overlaps, a million triangles in a point
+light of 1e-4 m at 1e8, lights 1e6 : 1, no light, 2^17 lights
+furnace of albedo 0.99, furnace of albedo 0.999, furnace of albedo 1
+metal of roughness 0, metal of roughness 1e-4, metal of roughness 1
+plane at 89.9 degrees, metal at 89.9 degrees
+glass of index 1, glass of index 1.0001, glass of index 5, nested glass
+camera inside of glass, camera on a wall, camera in a corner, field of view 0.1, field of view 179
+tiny cells, huge cells, tables of one slot, a table 99 % full, alpha 0, alpha 1
+newest frame weighs 1e-06, newest frame weighs 1, beyond 2^24 passes, after 2^26 samples
+what was learned decides nothing, what was learned decides 99 %, 1 photon, 1e7 photons
+1x1 pixel, 8192x64 pixels, 1e6 samples of a pixel, depth 0, depth 1, depth 1000
+"""
+
+
+def test_no_extreme_that_was_promised_is_missing(tool):
+    names = [case.name for case in tool.CASES]
+    assert len(set(names)) == len(names)
+    assert set(EXTREMES.strip().replace("\n", ", ").split(", ")) <= set(names)
+    # 2^17 lights are told apart by a tree and by photons too, not only by a table of their power.
+    chosen = {
+        case.features["LIGHT_SAMPLING"]
+        for case in tool.CASES
+        if case.name.startswith("2^17 lights,")
+    }
+    assert chosen == {1, 2}
+
+
+def test_a_case_has_a_calm_one_or_says_why_there_is_none(tool):
+    case = tool.CASES[0]
+    with pytest.raises(ValueError, match="expected a calm case, or why there is none"):
+        dataclasses.replace(case, calm=None)
+    with pytest.raises(ValueError, match="expected a calm case, or why there is none"):
+        dataclasses.replace(case, untimed="nobody knows")
+    names = {case.name for case in tool.CASES}
+    for case in tool.CASES:
+        assert case.calm is None or case.calm in names, case.name
+        assert not isinstance(case.truth, str) or case.truth.partition(" * ")[0] in names
+
+
+@pytest.mark.parametrize(
+    "change,why",
+    [
+        ({}, ""),
+        ({"bad": 1}, "1 pixels are not finite"),
+        ({"rejected": 2}, "2 rejected"),
+        ({"mean": 1.0201}, "the mean is off"),
+        ({"mean": float("nan")}, "the mean is off"),
+        ({"error": 0.01}, "too noisy to tell"),
+        ({"largest": 4.1}, "a pixel is too bright"),
+        ({"seconds": 2.1}, "it is too slow"),
+        ({"load": 0.9}, "0.9 of the table are full, not 0.99"),
+        ({"otherwise": ("FEW is 1, not 0: few triangles",)}, "FEW is 1, not 0: few triangles"),
+    ],
+)
+def test_each_number_of_a_row_can_fail(tool, monkeypatch, change, why):
+    case = next(case for case in tool.CASES if case.name == "a table 99 % full")
+    calm = tool.Picture(0, 0, 1.0, 0.0, 1.0, 64, 64, 1.0, "by power", {}, np.ones((8, 8)), 0.99)
+    seen = dataclasses.replace(calm, **change)
+    bench = tool.Bench(None, 8, 1, timed=True)
+    monkeypatch.setattr(bench, "render", lambda one, *_: seen if one is case else calm)
+    row = bench.row(case, "psf")
+    assert (row["verdict"], row["why"]) == ("FAILED" if why else "ok", why)
+
+
+def test_tables_are_as_small_as_a_case_wants_them(tool, device):
+    scene, settings = lit_floor(), resolve({}, "a case", "game")
+
+    def slots():
+        plan = make_plan(scene, settings, traits=device.traits)
+        counts = {buffer.name: buffer.count for stage in plan.stages for buffer in stage.buffers}
+        return counts["cell_keys"] // plan.ring, counts["guide_keys"], plan.cell_buckets
+
+    usual = slots()
+    with tool.tables_of(1):
+        assert slots() == (1, 1, 1)
+    with tool.tables_of(None):
+        assert slots() == usual
+
+
+def test_the_part_of_a_picture_around_a_ball_is_that_of_its_outline(tool):
+    cases = importlib.import_module("stability_cases")
+    square = np.array([[0, 0], [2, 0], [2, 2], [0, 2], [1, 1], [1, 0], [0.5, 1.5]])
+    assert cases.convex_area(square) == 4.0
+    # A sphere of radius 1 is a cone around its middle, seen somewhat wider than the ball of facets.
+    distance = np.hypot(0.3, 3.0)
+    sphere = np.pi / (distance**2 - 1.0) / (2.0 * np.tan(np.radians(45.0) / 2.0)) ** 2
+    assert 0.0 < cases.around_ball() - (1.0 - sphere) < 0.01
 
 
 def test_the_largest_pixel_is_that_of_all_samples_also_where_they_come_in_parts(tool, monkeypatch):
     def part_of(device, scene, settings, spp, *others):
         pixels = np.zeros((1, tool.SEEDS))
         pixels[0, settings.seed] = 16.0
-        return tool.Picture(0, 0, 2.0, 0.0, 16.0, 8, 1.0, {}, pixels)
+        return tool.Picture(0, 0, 2.0, 0.0, 16.0, 8, 8, 1.0, "by power", {}, pixels)
 
     monkeypatch.setattr(tool, "part_of", part_of)
     settings = Settings(integrator="metropolis")
