@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import subprocess
 import sys
 from pathlib import Path
 
@@ -79,9 +80,14 @@ def test_a_stop_that_is_not_handled_is_a_failure(play, signal, code):
     assert f"code {code}" in play(*parts, stops=((signal, 1.0),)).failure
 
 
-def test_a_stop_before_there_is_a_handler_is_none(play):
-    parts = [(0, "", {0: GREY}), (-15, "", {}), (0, "", {0: GREY})]
-    assert not play(*parts, stops=(("TERM", 1.0),)).failure
+@pytest.mark.parametrize(("handler", "known"), [("signal.SIG_DFL", False), ("print", True)])
+def test_a_process_without_a_handler_is_told(soak, handler, known):
+    code = f"import signal, sys; signal.signal(signal.SIGTERM, {handler}); print(flush=True)"
+    command = [sys.executable, "-c", f"{code}; sys.stdin.read()"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        process.stdout.readline()
+        assert soak._handles(process.pid) == known
+        process.stdin.close()
 
 
 def test_a_traceback_is_a_failure(play):

@@ -52,7 +52,7 @@ MOVING_SHARE = 0.25
 MOST_SECONDS = 900.0
 
 #: A process is stopped after so many seconds at the earliest, half of which it starts in, and so
-#: many more on average.
+#: many more on average; but not before it has a handler.
 FIRST_STOP, MEAN_STOP = 1.0, 1.5
 
 #: Numbers that a round may set a setting to: ends of ranges take too long for many rounds.
@@ -168,12 +168,9 @@ def run_round(now: Round, folder: Path) -> Outcome:
     for name, seconds in now.stops:
         for path in folder.glob("stopped*") if now.frames else ():
             path.unlink()  # The next part may come less far: which is the last would not be known.
-        before = _files(folder)
         code, text = _render([*again, *_resume(state)], name, seconds)
         outcome.stops += code != 0
-        # A process without a handler yet has not written anything.
-        unborn = code == -getattr(signal, f"SIG{name}") and _files(folder) == before
-        if code in (0, 130, -signal.SIGKILL) or unborn:
+        if code in (0, 130, -signal.SIGKILL):
             outcome.failure = _difference(now, folder, code == 0) if now.frames else ""
         else:
             outcome.failure = f"code {code}: {text}"
@@ -195,12 +192,6 @@ def run_round(now: Round, folder: Path) -> Outcome:
 
 def _resume(state: Path) -> list[str]:
     return ["--resume", str(state)] if state.exists() else []
-
-
-def _files(folder: Path) -> set[tuple[str, int, int]]:
-    """Return what another file of the same name would change."""
-    stats = [(path.name, path.stat()) for path in folder.iterdir()]
-    return {(name, stat.st_ino, stat.st_mtime_ns) for name, stat in stats}
 
 
 def _difference(now: Round, folder: Path, done: bool) -> str:
@@ -232,9 +223,25 @@ def _render(arguments: list[str], stop: str = "", seconds: float = MOST_SECONDS)
             if not stop:
                 process.kill()
                 return 1, f"not done after {seconds:.0f} s"
+            while stop != "KILL" and process.poll() is None and not _handles(process.pid):
+                time.sleep(0.01)
             process.send_signal(getattr(signal, f"SIG{stop}"))
             _, text = process.communicate(timeout=MOST_SECONDS)
     return process.returncode, text.strip()
+
+
+def _handles(process: int) -> bool:
+    """Return whether a process has a handler of SIGTERM; True where that is not to be known.
+
+    Python has none, and a handler of SIGINT that ends in a traceback before the program's own code
+    runs.
+    """
+    try:
+        status = Path(f"/proc/{process}/status").read_text()
+    except OSError:
+        return True
+    caught = int(status.partition("SigCgt:")[2].split()[0], 16)
+    return bool(caught >> (signal.SIGTERM - 1) & 1)
 
 
 def memory_growth(count: int) -> int:
