@@ -150,15 +150,18 @@ def test_every_part_of_the_white_bowl_looks_like_its_environment(device, environ
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("roughness", "least"), [(0.0, 0.995), (0.3, 0.95)])
-def test_glass_is_not_dark_where_its_shading_normals_lean(device, roughness, least):
-    """A wall whose corners share their normals with its rim: all lean towards it by 40 degrees.
+@pytest.mark.parametrize(
+    ("degrees", "roughness", "least"), [(40, 0.0, 0.97), (40, 0.3, 0.9), (33, 0.0, 0.93)]
+)
+def test_glass_is_not_dark_where_its_shading_normals_lean(device, degrees, roughness, least):
+    """A wall whose corners share their normals with its rim: all lean towards it.
 
-    They would mirror light between its faces through them, where there is none.  Single facets of
-    rough glass still do.
+    By 40 degrees they would mirror light between its faces through them, where there is none.
+    Single facets of rough glass still do.  By 33 they would mirror it along the wall.  Few paths do
+    not get out in 16 bounces.
     """
     box = primitives.box()
-    across, along = np.cos(np.radians(40)), np.sin(np.radians(40))
+    across, along = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     leaning = box.positions * [0.0, 0.0, across] + [0.0, along, 0.0]
     wall = replace(box, positions=box.positions * np.float32([20, 20, 0.1]), normals=leaning)
     glass = Material(base_color=(1.0, 1.0, 1.0), transmission=1.0, roughness=roughness)
@@ -168,7 +171,7 @@ def test_glass_is_not_dark_where_its_shading_normals_lean(device, roughness, lea
         (16, 16),
         environment=1.0,
     )
-    image = render(device, scene, 256, max_depth=200, roulette_depth=200)
+    image = render(device, scene, 256, max_depth=16, roulette_depth=16)
     assert least < image.rgb.mean() < 1.005
 
 

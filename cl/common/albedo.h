@@ -97,48 +97,52 @@ static inline Float sheen_albedo(Float roughness, Float cosine)
 #endif
 
 #if LAYERS
-#define MAX_TABLE_AXES 4
+#define TABLE_AXES 4
+#define TABLE_CORNERS (1 << TABLE_AXES)
 
 /// What a table of albedo_tables.h has at `places`, in [0, 1] along each axis, between entries linearly;
 /// 1 in lanes that are not wanted.
 static inline Float look_up(
-    Mask wanted, __constant const ushort *table, __constant const uint *shape, uint axes, const Float *places)
+    Mask wanted, __constant const ushort *table, __constant const uint *shape, const Float *places)
 {
-    float lane_place[MAX_TABLE_AXES][W];
-    float lane_value[W];
-    for (uint axis = 0; axis < axes; ++axis)
-        store_lanes(places[axis], lane_place[axis]);
-    store_lanes((Float)(1.0f), lane_value);
+    Float part[TABLE_AXES];
+    uint offset[TABLE_CORNERS];
+    UInt first = (UInt)(0u);
+    uint stride = 1;
+    offset[0] = 0;
+    for (uint axis = TABLE_AXES; axis-- > 0;) {
+        const uint most = shape[axis] - 1u;
+        // Not a number becomes 0 here: no index leaves the table.
+        const Float place = pick(places[axis] > 0.0f, min(places[axis], (Float)(1.0f)), (Float)(0.0f));
+        const Float at = place * (float)most;
+        const UInt whole = min(to_uint(at), (UInt)(most - 1u));
+        part[axis] = at - to_float(whole);
+        first += whole * stride;
+        const uint known = TABLE_CORNERS >> (axis + 1u);
+        for (uint corner = 0; corner < known; ++corner)
+            offset[known + corner] = offset[corner] + stride;
+        stride *= shape[axis];
+    }
+    uint lane_first[W];
+    float lane_entry[TABLE_CORNERS][W];
+    store_lanes_u(first, lane_first);
+    for (uint corner = 0; corner < TABLE_CORNERS; ++corner)
+        store_lanes((Float)(65535.0f), lane_entry[corner]);
     for (uint left = lane_bits(wanted); left; left &= left - 1u) {
         const uint k = lowest_bit(left);
-        uint first = 0;
-        uint stride = 1;
-        uint steps[MAX_TABLE_AXES];
-        float part[MAX_TABLE_AXES];
-        for (uint axis = axes; axis-- > 0;) {
-            const uint most = shape[axis] - 1u;
-            // Not a number becomes 0 here: no index leaves the table.
-            const float at = fmin(fmax(lane_place[axis][k], 0.0f), 1.0f) * (float)most;
-            const uint whole = min((uint)at, most - 1u);
-            part[axis] = at - (float)whole;
-            steps[axis] = stride;
-            first += whole * stride;
-            stride *= shape[axis];
-        }
-        float sum = 0.0f;
-        for (uint corner = 0; corner < 1u << axes; ++corner) {
-            uint index = first;
-            float weight = 1.0f;
-            for (uint axis = 0; axis < axes; ++axis) {
-                const uint far = corner >> axis & 1u;
-                index += far * steps[axis];
-                weight *= far ? part[axis] : 1.0f - part[axis];
-            }
-            sum += weight * (float)table[index];
-        }
-        lane_value[k] = sum * (1.0f / 65535.0f);
+        for (uint corner = 0; corner < TABLE_CORNERS; ++corner)
+            lane_entry[corner][k] = (float)table[lane_first[k] + offset[corner]];
     }
-    return load_lanes(lane_value);
+    // Corners on the far side of the first axis are the second half, and so on.
+    Float entry[TABLE_CORNERS];
+    for (uint corner = 0; corner < TABLE_CORNERS; ++corner)
+        entry[corner] = load_lanes(lane_entry[corner]);
+    for (uint axis = 0; axis < TABLE_AXES; ++axis) {
+        const uint half_of_them = TABLE_CORNERS >> (axis + 1u);
+        for (uint corner = 0; corner < half_of_them; ++corner)
+            entry[corner] += (entry[half_of_them + corner] - entry[corner]) * part[axis];
+    }
+    return entry[0] * (1.0f / 65535.0f);
 }
 #endif
 
@@ -170,10 +174,10 @@ static inline Reflected reflected_by_stretched(Mask stretched, Float alpha_x, Fl
         sqrt(ratio),
     };
     Reflected r;
-    const Float white = STRETCHED_MOST * look_up(stretched, STRETCHED_TABLE, STRETCHED_SHAPE, 4, whites);
+    const Float white = STRETCHED_MOST * look_up(stretched, STRETCHED_TABLE, STRETCHED_SHAPE, whites);
     r.white = clamp(white, (Float)(0.25f), (Float)(1.0f));
     // Of the edge the table has the cosine at which all facets together seem to be met.
-    const Float met = 1.0f - look_up(stretched, STRETCHED_EDGE_TABLE, STRETCHED_EDGE_SHAPE, 4, edges);
+    const Float met = 1.0f - look_up(stretched, STRETCHED_EDGE_TABLE, STRETCHED_EDGE_SHAPE, edges);
     r.edge = r.white * fifth_power_of_one_minus(met * STRETCHED_MET * (wo.z + width));
     r.white = pick(stretched, r.white, round.white);
     r.edge = pick(stretched, r.edge, round.edge);

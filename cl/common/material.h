@@ -254,20 +254,25 @@ static inline Bsdf fetch_bsdf(
 }
 
 #if TRANSMISSION
-/// The normal to shade solid glass by: the real one of `s` where a smooth facet with the shading normal would send
-/// `wo`, mirrored or refracted, to the wrong side of the real surface.
+/// The normal to shade solid glass by: the real one of `s` where a smooth facet with the shading normal
+/// would send `wo`, mirrored or refracted, to the wrong side of the real surface, or would reflect all
+/// where the real surface does not.
 ///
-/// eval_bsdf has no light there: walls of a vase whose normals are shared with its rim would be black.
+/// eval_bsdf has no light on the wrong side, and what should have left stays in glass for long: walls of a
+/// vase whose normals are shared with its rim would be black.
 static inline Vec3 normal_of_glass(SurfacePoint s, Bsdf b, Vec3 wo)
 {
     const Float cos_o = dot3(s.ns, wo);
     const Float shown = dot3(s.ng, wo);
     const Float agree = dot3(s.ng, s.ns);
-    const Float cos2_t = 1.0f - (1.0f - cos_o * cos_o) / (b.eta * b.eta);
-    const Mask mirrored_below = 2.0f * cos_o * agree <= shown;
-    const Mask refracted_above =
-        (cos2_t > 0.0f) & (agree * (cos_o / b.eta - sqrt(max(cos2_t, (Float)(0.0f)))) >= shown / b.eta);
-    return pick_v((b.transmission > 0.0f) & !b.thin & (mirrored_below | refracted_above), s.ng, s.ns);
+    const Float inverse = 1.0f / b.eta;
+    const Float cos2_t = 1.0f - (1.0f - cos_o * cos_o) * inverse * inverse;
+    const Mask lets_through = cos2_t > 0.0f;
+    const Float along = cos_o * inverse - sqrt(max(cos2_t, (Float)(0.0f)));
+    const Mask wrong = (2.0f * cos_o * agree <= shown)
+                       | (lets_through & (agree * along >= shown * inverse))
+                       | (!lets_through & (1.0f - shown * shown < b.eta * b.eta));
+    return pick_v(wrong & (b.transmission > 0.0f) & !b.thin, s.ng, s.ns);
 }
 
 /// e^x for x <= 0, to 1e-6: library calls are scalar on PoCL.
