@@ -33,6 +33,9 @@ HUGE_CELLS = dict.fromkeys(TINY_CELLS, 1e6)
 #: Why no time is compared of pictures of so few pixels.
 FEW_PIXELS = "a pass of few samples takes as long as its launches"
 
+#: Why none is compared of lights that are found in a tree.
+MANY_LEVELS = "each choice goes down 17 levels, not one: docs/many_lights.md has the time"
+
 #: What says how large hash tables and the map of photons are.
 SIZES = (
     *((module, "slots_of") for module in (cells, cell_history, guide, cache, material_cells)),
@@ -468,12 +471,16 @@ CASES: tuple[Case, ...] = (
     room_case("2^17 lights", change=with_many_lights),
     room_case(
         "2^17 lights, a tree of them",
+        None,
+        untimed=MANY_LEVELS,
         change=with_many_lights,
         settings={"light_sampling": "hierarchy"},
         features={"LIGHT_SAMPLING": 1},
     ),
     room_case(
         "2^17 lights, photons of them",
+        None,
+        untimed=MANY_LEVELS,
         change=with_many_lights,
         settings={"light_sampling": "photon"},
         features={"LIGHT_SAMPLING": 2},
