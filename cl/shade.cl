@@ -81,8 +81,8 @@ LARGE_FUNCTION void store_seen(
 // Of what a direction reflects, the least part by the base for which its light goes to a cell of that base.
 #define LEAST_SHARE 0.5f
 
-// Sharper reflections change within a cell.
-#define LEAST_CELL_ALPHA 0.16f
+// Later surfaces are seen from anywhere: sharper reflections look different from elsewhere.
+#define LATER_CELL_ALPHA 0.36f
 
 #if CELLS && BASE == 2
 /// Hand in what part of all that comes from beyond the first surface its base reflects.
@@ -552,11 +552,29 @@ kernel void shade_paths(
         store_seen(params, seen, reflects, reflects, sample, pixel, shape, s.p, before, s.ns, gate);
 #endif
 #if CELLS
-    const Mask chosen = goes_on & (vertex == 0u) & (max3(gate) > 0.0f)
+    Vec3 cell_gate = gate;
+    UInt ng = pack_unit(s.ng);
+    UInt mark = depth + 1u;
+#if CELL_LAYERS
+    // Where reflections are as wide as a cell looks from the camera, all that the surface reflects is shared.
+    const Float alpha = least_alpha(b);
+    Mask wide = alpha >= pick(camera_ray, (Float)(params->cell_alpha), (Float)(LATER_CELL_ALPHA));
+#if TRANSMISSION
+    wide &= b.transmission == 0.0f;
+#endif
+    if (any_lane(wide)) {
+        const UInt turn = mix_bits(mix_bits(get_u(path, PATH_SEED) + depth * 0xc2b2ae35u) + sample);
+        const UInt tagged = with_gloss(with_direction(ng, params->cell_directions, wo, turn), b.metallic >= 0.5f, alpha);
+        cell_gate = pick_v(wide, mul(beta, reflectance(b, chances)), gate);
+        ng = pick_u(wide, tagged, ng);
+        mark |= pick_u(wide, (UInt)(VERTEX_GLOSSY), (UInt)(0u));
+    }
+#endif
+    const Mask chosen = goes_on & (vertex == 0u) & (max3(cell_gate) > 0.0f)
                         & wants_cell(params, depth, length, FIELD(path, PATH_HIT_T), pdf_bsdf);
     if (any_lane(chosen)) {
-        store_cell_vertices(params, vertices, chosen, sample, pixel, s.p, pack_unit(s.ng), gate, length);
-        put_u(path, PATH_VERTEX, pick_u(chosen, depth + 1u, get_u(path, PATH_VERTEX)));
+        store_cell_vertices(params, vertices, chosen, sample, pixel, s.p, ng, cell_gate, length);
+        put_u(path, PATH_VERTEX, pick_u(chosen, mark, get_u(path, PATH_VERTEX)));
     }
 #endif
 
@@ -726,7 +744,11 @@ kernel void shade_paths(
                   mul(mul(cache_gate, f), scale(light.radiance, weight / pick(lit, light.pdf, (Float)(1.0f)))));
 #endif
 #if CELLS == 2
-            put_v(path, RAY_FIELD(ray, LIGHT_SHARE_R), pick_v(chosen, base_share(b, chances, base, wi_local, f), share));
+            Vec3 light_share = base_share(b, chances, base, wi_local, f);
+#if CELL_LAYERS
+            light_share = pick_v(wide, vec3_all((Float)(1.0f)), light_share);
+#endif
+            put_v(path, RAY_FIELD(ray, LIGHT_SHARE_R), pick_v(chosen, light_share, share));
 #endif
 #if BASE == 2
             put_v(path, RAY_FIELD(ray, BASE_LIGHT_R), pick_v(camera_ray, base_share(b, chances, base, wi_local, f), base_part));
@@ -779,32 +801,28 @@ kernel void shade_paths(
 #if CELLS == 2
     const Vec3 by_base = base_share(b, chances, base, drawn, f);
     share = pick_v(chosen, by_base, share);
-    const Mask by_gloss = max3(by_base) < LEAST_SHARE;
     // Of a path that goes on by a coat the base's cell would get little: a later vertex may share its light.
-    const Mask gives_up = chosen & by_gloss & (Mask)(params->filter_direct ? 0 : -1)
-                          & ((get_u(path, PATH_VERTEX) & VERTEX_SKY) == 0u);
-    UInt shared_at = pick_u(gives_up, (UInt)(0u), get_u(path, PATH_VERTEX));
+    Mask gives_up = chosen & (max3(by_base) < LEAST_SHARE) & (Mask)(params->filter_direct ? 0 : -1)
+                    & ((get_u(path, PATH_VERTEX) & VERTEX_SKY) == 0u);
 #if CELL_LAYERS
-    const Mask wide = goes_on & by_gloss & !delta & (drawn.z > 0.0f) & (b.alpha >= LEAST_CELL_ALPHA);
-    const Mask glossy = wide & (vertex == 0u) & wants_cell(params, depth, length, FIELD(path, PATH_HIT_T), pdf_bsdf);
-    if (any_lane(glossy)) {
-        const UInt turn = mix_bits(mix_bits(get_u(path, PATH_SEED) + depth * 0xc2b2ae35u) + sample);
-        const UInt tagged = with_direction(pack_unit(s.ng), params->cell_directions, wo, turn);
-        const Vec3 tint = add(scale(b.base_color, b.metallic), vec3_all(1.0f - b.metallic));
-        store_cell_vertices(params, vertices, glossy, sample, pixel, s.p, tagged, mul(beta, tint), length);
-        share = pick_v(glossy, sub(vec3_all((Float)(1.0f)), by_base), share);
-        shared_at = pick_u(glossy, (depth + 1u) | VERTEX_GLOSSY, shared_at);
-    }
+    share = pick_v(chosen & wide, vec3_all((Float)(1.0f)), share);
+    gives_up &= !wide;
 #endif
     put_v(path, PATH_SHARE_R, share);
-    put_u(path, PATH_VERTEX, shared_at);
+    put_u(path, PATH_VERTEX, pick_u(gives_up, (UInt)(0u), get_u(path, PATH_VERTEX)));
 #endif
 #if BASE == 2
     base_part = pick_v(camera_ray, base_share(b, chances, base, drawn, f), base_part);
     put_v(path, PATH_BASE_SHARE_R, base_part);
 #if CELLS
-    if (any_lane(reflects))
-        store_base_share(params, seen, reflects, sample, pixel, base_part);
+    if (any_lane(reflects)) {
+        Vec3 in_all = base_part;
+#if CELL_LAYERS
+        // Of all that a cell brings.
+        in_all = pick_v(chosen & wide, demodulated(gate, cell_gate), base_part);
+#endif
+        store_base_share(params, seen, reflects, sample, pixel, in_all);
+    }
 #endif
 #endif
 #if GUIDE

@@ -378,9 +378,7 @@ def _cell_layers(settings: Settings, glossy: bool) -> Feature:
         return Feature(0, "cell_layers is false: what coats and metals reflect is not shared")
     if not glossy:
         return Feature(0, "every material is matt")
-    if settings.screen_filter != "off":
-        return Feature(0, "screen_filter averages diffuse light alone")
-    return Feature(1, "cell_layers shares what coats and metals reflect, apart from diffuse light")
+    return Feature(1, "cell_layers shares what wide coats and metals reflect, with diffuse light")
 
 
 def _walls(settings: Settings) -> Feature:

@@ -214,7 +214,7 @@ class Settings:
         True, doc="keep light apart that a wall inside a cell separates: short rays look for it"
     )
     cell_layers: bool = _switch(
-        False, doc="share what coats and metals reflect too, apart from diffuse light"
+        True, doc="share what coats and metals reflect too, where that is wider than a cell"
     )
     cell_directions: int = _number(
         0,

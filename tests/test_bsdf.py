@@ -469,3 +469,52 @@ def test_nothing_crosses_the_real_surface_by_a_shading_normal(lane_device):
     given = np.full((len(bsdfs), 4), -1.0)
     values, pdfs = evaluate(lane_device, records, given, wo, wi, side=-wi[:, 2])
     assert not values.any() and not pdfs.any()
+
+
+def layered(bsdf, **fields):
+    """Return the record of a surface with coat, sheen, tint or stretched facets."""
+    places = {"tint": 10, "coat": 13, "coat_alpha": 14, "sheen": 15, "roughness": 18, "alpha_y": 19}
+    record = bsdf.record()
+    for name, value in fields.items():
+        values = np.atleast_1d(value)
+        record[places[name] : places[name] + len(values)] = values
+    return record
+
+
+@pytest.mark.parametrize("layers", [0, 1])
+def test_reflectance_is_about_that_of_the_samples(device, layers):
+    """Light is divided by it before it is shared: what differs is blurred, not lost."""
+    plain = {name: b for name, b in MATERIALS.items() if b.transmission == 0.0}
+    plain["copper"] = Bsdf(roughness=0.6, metallic=1.0, base_color=(0.9, 0.5, 0.0))
+    surfaces = [b.record() for b in plain.values()]
+    least_alphas = [1.0 if name == "lambert" else b.alpha for name, b in plain.items()]
+    if layers:
+        surfaces += [
+            layered(Bsdf(roughness=0.6), sheen=(0.4, 0.2, 0.1), roughness=0.5),
+            layered(Bsdf(roughness=0.8), coat=0.8, coat_alpha=0.36),
+            layered(Bsdf(roughness=0.9), tint=(1.0, 0.5, 0.0)),
+            layered(plain["copper"], alpha_y=0.1),
+        ]
+        least_alphas += [0.36, 0.36, 0.81, 0.1]
+    cosines = (0.2, 0.6, 1.0)
+    records = np.repeat(surfaces, len(cosines), axis=0)
+    directions = np.tile([direction(c) for c in cosines], (len(surfaces), 1))
+    count = 4096
+    numbers = np.random.default_rng(11).random((count * len(records), 3))
+    by_chance = np.full((len(numbers), 4), -1.0)
+    rows = np.tile(records, (count, 1)), by_chance, np.tile(directions, (count, 1)), numbers
+    _, values, pdfs = sample(device, *rows, layers)
+    weights = np.where(pdfs[:, None] > 0.0, values / np.maximum(pdfs, 1e-30)[:, None], 0.0)
+    exact = weights.reshape(count, len(records), 3).mean(axis=0)
+    parts, least = run(
+        device,
+        "list_reflectances",
+        {"materials": records.T, "wo": directions.T},
+        {"parts": (np.float32, 3), "least": (np.float32, 1)},
+        layers,
+    )
+    ratio = parts.T[exact > 0.01] / exact[exact > 0.01]
+    assert 0.75 < ratio.min()
+    assert ratio.max() < 1.35
+    assert (parts > 0.0).all()
+    np.testing.assert_allclose(least[:: len(cosines)], least_alphas, rtol=1e-4)

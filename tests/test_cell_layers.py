@@ -1,4 +1,4 @@
-"""What coats and metals reflect is shared apart from diffuse light, by where paths come from."""
+"""Coats and metals share what they reflect where that is wide, by kind and by direction."""
 
 from __future__ import annotations
 
@@ -75,10 +75,9 @@ def test_parts_of_directions_are_those_of_a_model_and_keys_tell_them_apart(lane_
 def test_layers_that_nothing_asks_for_are_left_out_and_the_plan_says_why():
     glossy, matt = room(COATED), room(lambertian(0.5))
     for scene, settings, why in (
-        (glossy, Settings(**FILTER), "cell_layers is false"),
+        (glossy, Settings(**{**LAYERS, "cell_layers": False}), "cell_layers is false"),
         (glossy, Settings(cell_layers=True), "path_filter is off"),
         (matt, Settings(**LAYERS), "every material is matt"),
-        (glossy, Settings(**LAYERS, screen_filter="path_space"), "screen_filter averages diffuse"),
     ):
         assert why in dict(make_plan(scene, settings).left_out)["cell_layers"]
     assert make_plan(glossy, Settings(**LAYERS)).features["CELL_LAYERS"].value == 1
@@ -100,9 +99,11 @@ def test_metal_is_shared_by_direction_and_only_with_layers(device):
     """One place for all: a cell of metal for every part of directions, none of diffuse light."""
     scene = build([floor(50.0, METAL)], camera((0, 2, 0.001), (0, 0, 0), 60), environment=1.0)
     stored = {}
-    for name, ways in (("none", {}), ("one", LAYERS), ("parts", PARTED)):
+    for name, ways in (("none", {"cell_layers": False}), ("one", LAYERS), ("parts", PARTED)):
         settings = {**FILTER, "filter_vertex": "1", **ways, "roulette_depth": 64}
-        opened = patched(renderer(device, scene, **settings), cell_width=1e30, cell_flags=0)
+        opened = patched(
+            renderer(device, scene, **settings), cell_width=1e30, cell_alpha=0.0, cell_flags=0
+        )
         stored[name] = image_of(opened, 4).stats["cells"]["cells_per_pass"]
     assert stored["none"] == 0
     # Beyond the floor is the sky: with that light from afar, in one level.
@@ -114,9 +115,66 @@ def test_a_path_that_goes_on_by_a_coat_shares_at_a_later_vertex(device):
     """Its light is none of the first base's: both are shared, and the sum stays the same."""
     scene = room(COATED)
     truth = render(device, scene, 512, seed=3).rgb
-    ways = {**FILTER, "filter_vertex": "1", "filter_direct": False, "cell_size": 4.0}
+    ways = {**LAYERS, "cell_layers": False, "cell_size": 4.0}
     image = render(device, scene, 64, **ways).rgb
     assert image.mean() == pytest.approx(truth.mean(), rel=0.02)
+
+
+def test_kinds_of_surfaces_have_cells_of_their_own(lane_device):
+    alpha = np.exp2(np.linspace(-9, 0, 256, dtype=np.float32))
+    metal = (np.arange(256) % 2).astype(np.float32)
+    keys = planes.run(
+        lane_device,
+        "cells_test.cl",
+        "tag_gloss",
+        {"alpha": alpha, "metal": metal},
+        {"keys": (np.uint32, 1)},
+    )[0]
+    kinds = np.clip(np.floor(np.log2(alpha)) + 8, 0, 7) + 8 * metal
+    assert len(np.unique(kinds)) == 16
+    both = np.unique(np.stack([kinds, keys]), axis=1)
+    assert both.shape[1] == len(np.unique(keys)) == 16
+
+
+def error_of(device, scene, truth, **settings):
+    """Return the relative squared error of a picture of 4 samples, a mean over two seeds."""
+    floor = 1e-2 * truth.mean() ** 2
+    images = (render(device, scene, 4, **LAYERS | settings, seed=seed).rgb for seed in (5, 6))
+    return np.mean([((image - truth) ** 2 / (truth**2 + floor)).mean() for image in images])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("material", [replace(COATED, base_color=(0.03, 0.05, 0.06)), METAL])
+def test_sharing_what_is_glossy_takes_noise_away(device, material):
+    """A lamp that is found by chance alone: nearly all noise is in what the cells may share."""
+    scene = room(replace(material, roughness=0.7), size=(96, 64))
+    truth = render(device, scene, 2048, seed=9).rgb
+    ways = {"filter_direct": True, "direct_sampling": "bsdf", "cell_size": 8.0}
+    error = error_of(device, scene, truth, **ways)
+    assert error < 0.7 * error_of(device, scene, truth, **ways, cell_layers=False)
+
+
+def test_reflections_that_are_sharper_than_a_cell_stay_with_their_pixels(device):
+    """From a distance at which a pixel sees half of all directions nothing is wide enough."""
+    scene = room(COATED)
+    ways = {**LAYERS, "filter_restore": False, "cell_jitter": False}
+    images = [
+        image_of(patched(renderer(device, scene, **ways), cell_alpha=least), 2).rgb
+        for least in (0.0, 0.36, 0.37, 1.0)
+    ]
+    # The GGX alpha of COATED is 0.36.
+    assert images[0].tobytes() == images[1].tobytes() != images[2].tobytes()
+    assert images[2].tobytes() == images[3].tobytes()
+
+
+@pytest.mark.parametrize("layers", [False, True])
+def test_the_screen_filter_gets_what_bases_reflect_of_shared_light(device, layers):
+    """A ball of no neighbours: the picture is that of the cells, whatever is told apart."""
+    scene = room(COATED, METAL)
+    ways = {**LAYERS, "cell_layers": layers, "filter_restore": False, "cell_size": 4.0}
+    plain = render(device, scene, 16, **ways).rgb
+    filtered = render(device, scene, 16, **ways, screen_filter="path_space").rgb
+    assert filtered.mean() == pytest.approx(plain.mean(), rel=0.02)
 
 
 def test_same_bits_for_any_pool(device):

@@ -279,7 +279,7 @@ def test_every_flag_at_once_renders(wants):
     # triangles.
     off = {name for name, feature in opened.plan.features.items() if not feature.value}
     # What averages take from a pixel is kept apart only for what the screen filter is in place of.
-    unused = {"CELL_LAYERS", "METROPOLIS", "INSTANCES", "MOTION", "RESTORE", "SPHERES"}
+    unused = {"METROPOLIS", "INSTANCES", "MOTION", "RESTORE", "SPHERES"}
     assert off == unused | {"VIRTUAL_LIGHTS"}
     left_out = dict(opened.plan.left_out)
     assert left_out.keys() == {name.lower() for name in off}

@@ -180,9 +180,7 @@ JOBS = {
     # Several tiles of RESTORE_TILE and of PROBE_TILE, those at the edges no whole ones.
     "tiles": Job(room, "psf", {"cell_walls": False}, size=(37, 23)),
     "tiles of a sequence": Job(room_that_moves, "game", times=(1.0,), size=(10, 9)),
-    "layers of cells": Job(
-        everything, "psf", {"cell_layers": True, "cell_directions": 4}, tree=False
-    ),
+    "layers of cells": Job(everything, "psf", {"cell_directions": 4}, tree=False),
     "screen filter": Job(room, "pt", {"screen_filter": "path_space"}, tree=False),
     "splits": Job(room, "pt", {"splits": 2, "sampler": "random", "direct_sampling": "bsdf"}),
     "virtual lights": Job(

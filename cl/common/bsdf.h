@@ -49,6 +49,8 @@ typedef struct {
     Facets facets;
     Float gain;   // what scattering between facets adds to a white mirror, relatively
     Float enters; // share of the light that comes to the diffuse base, over that which leaves it
+    Float coated; // part of the light that the dielectric over the base reflects
+    Float edge;   // part that white facets reflect beside their f0
 #endif
 } LobeChances;
 
@@ -151,6 +153,8 @@ LARGE_FUNCTION LobeChances lobe_chances(Bsdf b, Vec3 wo)
 #endif
     c.gain = (1.0f - seen.white) / seen.white;
     const Float reflected = coat_albedo(b, seen);
+    c.coated = (1.0f - b.metallic) * reflected;
+    c.edge = seen.edge;
     c.enters = (1.0f - b.metallic) * (1.0f - reflected) / max(1.0f - average_coat_albedo(b, alpha), 1e-6f);
 #if TRANSMISSION
     c.enters *= 1.0f - b.transmission;
@@ -239,6 +243,37 @@ static inline Float base_gate(LobeChances chances)
 #else
     return chances.enters;
 #endif
+}
+
+/// About the part of light from everywhere that goes to wo; 0 where nothing does.  Of glass, what its far side
+/// lets through is not counted.
+static inline Vec3 reflectance(Bsdf b, LobeChances chances)
+{
+    const Vec3 white = vec3_all((Float)(1.0f));
+    const Float single = 1.0f / (1.0f + chances.gain) - chances.edge;
+    const Vec3 metal = mul(add_scaled(vec3_all(chances.edge), b.base_color, single), add_scaled(white, b.base_color, chances.gain));
+#if LAYERS
+    const Vec3 tint = lerp3(b.tint, white, chances.edge);
+    const Vec3 mirrored = scale(add(scale(tint, chances.coated), scale(metal, b.metallic)), chances.under_coat);
+    const Float fuzz = (1.0f - chances.under_sheen) / max(max3(b.sheen), 1e-6f);
+    const Vec3 over = add_scaled(vec3_all(chances.under_sheen - chances.under_coat), b.sheen, fuzz);
+    return add(add_scaled(mirrored, b.base_color, base_gate(chances)), over);
+#else
+    const Vec3 mirrored = add_scaled(vec3_all(chances.coated), metal, b.metallic);
+    return add_scaled(mirrored, b.base_color, base_gate(chances));
+#endif
+}
+
+/// The least alpha of what reflects light beside the base; 1 where nothing does.
+static inline Float least_alpha(Bsdf b)
+{
+    const Mask mirrors = (b.metallic > 0.0f) | (b.f0 > 0.0f) | (b.specular > 0.0f);
+    Float least = pick(mirrors, b.alpha, (Float)(1.0f));
+#if LAYERS
+    least = pick(mirrors, min(least, b.alpha_y), least);
+    least = pick(b.coat > 0.0f, min(least, b.coat_alpha), least);
+#endif
+    return least;
 }
 
 /// Share of `f`, which eval_bsdf gave for wo and wi, that the diffuse base has.

@@ -40,7 +40,7 @@ static inline CellQuery load_query(
     query.extra = params->cell_flags & CELL_IDENTITY ? pixel + 1u : (UInt)(0u);
 #if CELL_LAYERS
     const Mask glossy = (vertex & VERTEX_GLOSSY) != 0u;
-    query.extra += pick_u(glossy, direction_of(GATHER_U(vertices, pixel, ng)), (UInt)(0u));
+    query.extra += pick_u(glossy, gloss_of(GATHER_U(vertices, pixel, ng)), (UInt)(0u));
 #endif
     query.width = GATHER(vertices, pixel, length) * width;
     return query;

@@ -32,8 +32,10 @@ typedef struct {
     UInt key;
 } CellKey;
 
-// What cells of gloss tell apart beside the place lies in the last bits of both halves of a packed normal.
+// What cells of gloss tell apart beside the place lies in the last bits of both halves of a packed normal: the
+// direction that light goes to, and the kind of the surface.
 #define DIRECTION_BITS 0x000f000fu
+#define GLOSS_BITS 0x00300030u
 
 /// The packed normal `ng` with the part of the octahedron's square, of `side` x `side`, that `wo` is in; `random`
 /// blurs the borders of the parts.
@@ -49,11 +51,21 @@ static inline UInt with_direction(UInt ng, uint side, Vec3 wo, UInt random)
     return (ng & ~DIRECTION_BITS) | i | (j << 16);
 }
 
-/// What tells the cells of gloss of one place apart, and from those of diffuse light; never 0.
-static inline UInt direction_of(UInt ng)
+/// The packed normal `ng` with the kind of a surface, so that mirrors share no light with matt surfaces beside them:
+/// whether it is a metal, and which power of two its GGX `alpha` comes next to.
+static inline UInt with_gloss(UInt ng, Mask metal, Float alpha)
 {
-    const UInt bits = ng & DIRECTION_BITS;
-    return (1u + (bits & 15u) + (bits >> 12)) * 0x9e3779b1u;
+    // Of alphas from 2^-8 to 1.
+    const UInt octave = min((as_bits(max(alpha, 0x1p-8f)) >> 23) - 119u, (UInt)(7u));
+    const UInt kind = octave + pick_u(metal, (UInt)(8u), (UInt)(0u));
+    return (ng & ~GLOSS_BITS) | ((kind & 3u) << 4) | ((kind >> 2) << 20);
+}
+
+/// What tells the cells of gloss of one place apart, and from those of diffuse light; never 0.
+static inline UInt gloss_of(UInt ng)
+{
+    const UInt bits = ng & (DIRECTION_BITS | GLOSS_BITS);
+    return (1u + (bits & 63u) + (bits >> 10)) * 0x9e3779b1u;
 }
 
 // Purposes of random numbers.

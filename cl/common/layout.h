@@ -66,7 +66,7 @@
 #define VERTEX_REJECTED 0x40000000u // set if what was gathered is too large for a cell
 #define VERTEX_WALL_SHIFT 24u // first bit of what separates the vertex from where it is stored
 #define VERTEX_WALL_MASK 7u // of that, shifted: 0 nothing, or 1 + the side that a wall faces
-#define VERTEX_GLOSSY 0x00200000u // set if what is shared is what coats and metals reflect there
+#define VERTEX_GLOSSY 0x00200000u // set if coats and metals share what they reflect there
 #define VERTEX_SKY 0x00400000u // set if its shadow ray goes where the sky is even: that light is shared
 #define VERTEX_MASK 0x001FFFFFu // 1 + depth
 #define CELL_JITTER 1u // points are moved before they are told apart by cells
@@ -496,6 +496,7 @@ typedef struct {
     uint cell_flags; // CELL_JITTER, CELL_NEAR, CELL_IDENTITY
     float cell_width; // edge of a cell in the first pass, m per m of the path
     uint cell_directions; // parts of directions that cells of gloss tell apart, a side
+    float cell_alpha; // least GGX alpha of coats whose light the first surface shares
     float cell_shrink; // exponent of the number of the pass in the edge of a cell
     float cell_steps; // fixed-point steps of a sum of radiance per unit, a power of two
     float cell_limit; // radiance from which a sample is too large for the sums
@@ -536,7 +537,6 @@ typedef struct {
     float cache_trace; // least chance that a path goes on where a cell is known
     uint material_slots; // of the table of the parameter cloud, a power of two
     float material_width; // edge of its cells, m per m from the camera
-    uint pad[1]; // fills the record
 } Params;
 
 /// Eight children of an inner node; 256 bytes, so that a node fills whole cache lines.

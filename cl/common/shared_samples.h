@@ -20,7 +20,8 @@ static inline Vec3 load_beyond(__global const Beyond *beyond, UInt pixel)
 static inline float4 base_share_of(__global const Beyond *beyond, __global const Seen *seen, ulong sample)
 {
 #if BASE == 2
-    if ((beyond[sample].vertex & VERTEX_MASK) > 1u)
+    const uint vertex = beyond[sample].vertex;
+    if ((vertex & VERTEX_MASK) > 1u || (vertex & VERTEX_GLOSSY) != 0u)
         return (float4)(vload3(0, seen[sample].share), 0.0f);
 #endif
     return (float4)(1.0f);

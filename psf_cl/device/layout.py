@@ -117,6 +117,7 @@ PARAMS = Record(
     uint cell_flags - CELL_JITTER, CELL_NEAR, CELL_IDENTITY
     float cell_width - edge of a cell in the first pass, m per m of the path
     uint cell_directions - parts of directions that cells of gloss tell apart, a side
+    float cell_alpha - least GGX alpha of coats whose light the first surface shares
     float cell_shrink - exponent of the number of the pass in the edge of a cell
     float cell_steps - fixed-point steps of a sum of radiance per unit, a power of two
     float cell_limit - radiance from which a sample is too large for the sums
@@ -1119,7 +1120,7 @@ CONSTANTS = (
     ("VERTEX_REJECTED", 0x40000000, "set if what was gathered is too large for a cell"),
     ("VERTEX_WALL_SHIFT", 24, "first bit of what separates the vertex from where it is stored"),
     ("VERTEX_WALL_MASK", 7, "of that, shifted: 0 nothing, or 1 + the side that a wall faces"),
-    ("VERTEX_GLOSSY", 0x200000, "set if what is shared is what coats and metals reflect there"),
+    ("VERTEX_GLOSSY", 0x200000, "set if coats and metals share what they reflect there"),
     (
         "VERTEX_SKY",
         0x400000,

@@ -56,13 +56,15 @@ def parameters(
 ) -> dict[str, Any]:
     """Return what the kernels need to know, by the names of ``layout.PARAMS``."""
     steps = fixed_point(HEADROOM * brightest(scene), pixel_count)
+    width = settings.cell_size * pixel_per_meter(scene)
     return {
         "cell_min_count": settings.cell_min_count,
         "cell_slots": slots_of(pixel_count, halvings),
         "cell_flags": layout.CONSTANT["CELL_JITTER"] * settings.cell_jitter
         + layout.CONSTANT["CELL_NEAR"] * settings.cell_near,
         "cell_directions": settings.cell_directions,
-        "cell_width": settings.cell_size * pixel_per_meter(scene),
+        "cell_width": width,
+        "cell_alpha": width,
         "cell_shrink": SHRINK_EXPONENT if settings.cell_shrink else 0.0,
         "cell_steps": steps,
         "cell_limit": 2.0**SUM_BITS / steps / slots_for(pixel_count),

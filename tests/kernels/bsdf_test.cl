@@ -114,3 +114,14 @@ kernel void sample_directions(
     store_vec3(values, 0, value);
     STORE(pdfs, 0, pdf);
 }
+
+#if GLOSSY
+/// parts: what `reflectance` says for wo; least: what `least_alpha` does.
+kernel void list_reflectances(
+    global const float *materials, global const float *wo, global float *parts, global float *least)
+{
+    const Bsdf b = load_bsdf(materials);
+    store_vec3(parts, 0, reflectance(b, lobe_chances(b, LOAD_V(wo, 0))));
+    STORE(least, 0, least_alpha(b));
+}
+#endif
