@@ -68,6 +68,9 @@ CHAINS = 256
 BIASING = ("path_filter", "temporal", "screen_filter")
 BIASING_VALUES = {"material_cache": ("hash_grid",), "termination": ("cache",)}
 
+#: Counters of what is in the picture, only not shared: nothing is lost.
+UNSHARED = {"cells rejected_cells"}
+
 PAIRS = "pairs of settings"
 
 COLUMNS = (
@@ -230,7 +233,9 @@ def summed_up(image: Image, seconds: float) -> Picture:
     }
     return Picture(
         bad=int((~finite).sum()),
-        rejected=sum(value for name, value in counters.items() if "rejected" in name),
+        rejected=sum(
+            value for name, value in counters.items() if "rejected" in name and name not in UNSHARED
+        ),
         mean=float(luminance[finite].mean()) if finite.any() else math.nan,
         error=math.sqrt(variance / luminance.size),
         largest=float(pixels.max()),
