@@ -5,10 +5,11 @@ dependency of psf_cl.  Its fast ``llvm_ad_rgb`` variant needs LLVM (Debian: ``li
 ``DRJIT_LIBLLVM_PATH`` set to its library; without that ``scalar_rgb`` is used.
 
 What is compared is light transport, so only what both renderers mean alike is accepted: flat
-triangles, materials without cut-outs, one-sided area lights, point and directional lights, a
-constant environment, pinhole and thin lens.  Materials that are more than Lambertian run in Mitsuba
-as tools/mitsuba_bsdf.py writes them, which needs a Dr.Jit variant; ``--lambertian`` makes all
-materials Lambertian and opaque first.
+triangles, materials without cut-outs, one-sided area lights, point and directional lights, an
+environment, pinhole and thin lens.  Materials that are more than Lambertian run in Mitsuba as
+tools/mitsuba_bsdf.py writes them, which needs a Dr.Jit variant and gives back nothing of what rough
+metal and glass lose between facets; ``--lambertian`` makes all materials Lambertian and opaque
+first, ``--own-materials`` such that Mitsuba's own plugins have the same.
 
 Both renderers average K independent seeds.  The criterion, for each comparison: the means of all
 channels agree within 1 %, and the luminances of blocks of 16x16 pixels within 3 sigma, with as many

@@ -2,6 +2,7 @@
 
 Import after the variant is set, which must be a Dr.Jit one.  The formulas are those that
 ``cl/common/bsdf.h`` names the sources of; here they are written a second time, from them.
+Light between facets, layers and sheets are left out.
 Mitsuba's ``wi`` points to the camera; here o does, and i to the light.
 """
 

@@ -25,7 +25,9 @@ from psf_cl.scene.model import (
     Shape,
     Texture,
     emits,
+    has_layers,
     is_cut_out,
+    lets_through,
     shines,
 )
 
@@ -34,6 +36,9 @@ MASK_OVERSAMPLING = 4
 
 # Mitsuba's microfacets take no alpha of 0; psf_cl draws roughness 0 with this one.
 SHARPEST_ALPHA = 1e-3
+
+# Roughness up to which light between facets, which is lost in Mitsuba, is 3e-3 of it at most.
+LITTLE_LOSS = 0.2
 
 
 def set_variant(name: str | None = None) -> str:
@@ -85,6 +90,11 @@ def differences(scene: Scene, own_materials: bool = False) -> list[str]:
     ]
     found = {
         "reflection other than Lambertian": own_materials and any(not _is_diffuse(m) for m in used),
+        "rough metal or glass (Mitsuba loses light between facets)": any(map(_loses_light, used)),
+        "clear coats, sheen, stretched or coloured highlights": any(map(has_layers, used)),
+        "thin-walled glass": any(lets_through(m) and m.thin_walled for m in used),
+        "normal maps": any(m.normal_texture >= 0 for m in used),
+        "vertex colours": any(s.mesh.colors is not None for s in tables.visible_shapes(scene)),
         "alpha masks (Mitsuba's shadow rays do not see through them)": any(map(is_cut_out, used)),
         "emission on both sides": any(emits(m) and m.double_sided for m in used),
         "shading normals": any(s.mesh.normals is not None for s in tables.visible_shapes(scene)),
@@ -208,6 +218,10 @@ def _image_sky(environment: Environment) -> dict[str, Any]:
         "bitmap": mi.Bitmap(np.ascontiguousarray(radiance, np.float32)),
         "to_world": mi.ScalarTransform4f(placed),
     }
+
+
+def _loses_light(material: Material) -> bool:
+    return (material.metallic > 0.0 or lets_through(material)) and material.roughness > LITTLE_LOSS
 
 
 def _is_clear(material: Material) -> bool:
