@@ -516,7 +516,7 @@ CASES: tuple[Case, ...] = (
         None,
         depth=3,
         size=(1, 1),
-        own_spp=1 << 14,
+        own_spp=1 << 16,
         untimed=FEW_PIXELS,
     ),
     furnace_case("8192x64 pixels", "depth 3", depth=3, size=(8192, 64), spp=0.05),
