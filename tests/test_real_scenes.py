@@ -1,4 +1,4 @@
-"""Scenes that others made: they render, and two of them look as Tungsten shows them.
+"""Scenes that others made: they render, and some look as other renderers show them.
 
 They are in the folder that $PSF_CL_SHARED_SCENES names.
 """
@@ -109,6 +109,36 @@ def test_veach_bidir_looks_as_its_reference_glass_included(device):
     assert agreement.correlation >= 0.98
     assert agreement.share_within >= 0.9
     assert abs(agreement.mean_ratio - 1.0) <= 0.06
+
+
+#: Luminances of blocks of 16x16 pixels of the living-room at 64x36 as Mitsuba 3.9 shows it, to
+#: 0.2 % where it is light and 1.4 % where it is dark: 2048 samples, ``mitsuba_scene.plain`` and
+#: ``flat`` materials and shapes, ``own_materials`` (tools/compare_mitsuba.py).
+LIVING_ROOM = [
+    [0.2109, 0.0752, 0.1111, 0.0114],
+    [0.0702, 0.0630, 0.0929, 0.0129],
+    [0.0066, 0.0077, 0.0058, 0.0034],
+]
+
+
+def test_living_room_looks_as_mitsuba_shows_it_by_its_sky_glass_included(device):
+    scene = load_scene(Path(ROOT) / "interiors" / "living-room.glb", size=(64, 36))
+    materials = tuple(
+        replace(m, alpha_mode="opaque", specular=float(m.metallic + m.transmission > 0.0))
+        for m in scene.materials
+    )
+    shapes = tuple(replace(s, mesh=replace(s.mesh, normals=None)) for s in scene.shapes)
+    scene = replace(scene, materials=materials, shapes=shapes)
+    luminance = rendered(device, scene, spp=512).rgb.astype(np.float64) @ LUMINANCE
+    rows, columns = np.arange(0, 36, 16), np.arange(0, 64, 16)
+
+    def sums(values):
+        return np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1)
+
+    pixels = sums(np.ones_like(luminance))
+    blocks = sums(luminance) / pixels
+    np.testing.assert_allclose(blocks, LIVING_ROOM, rtol=0.015, atol=3e-4)
+    np.testing.assert_allclose(luminance.mean(), np.average(LIVING_ROOM, weights=pixels), rtol=0.01)
 
 
 def test_environment_of_the_living_room_comes_through_its_windows(device):
