@@ -538,7 +538,7 @@ kernel void shade_paths(
     const LobeChances chances = lobe_chances(b, wo_local);
 
 #if CELLS || BASE
-    // Light is divided by the reflectance of the base before it is shared: textures stay sharp.
+    // Light is divided by the reflectance of what shares it: textures stay sharp.
 #if CELLS == 2 || BASE == 2
     const Float base = base_gate(chances);
     const Vec3 gate = mul(beta, scale(b.base_color, base));
@@ -558,7 +558,7 @@ kernel void shade_paths(
 #if CELL_LAYERS
     // Where reflections are as wide as a cell looks from the camera, all that the surface reflects is shared.
     const Float alpha = least_alpha(b);
-    Mask wide = alpha >= pick(camera_ray, (Float)(params->cell_alpha), (Float)(LATER_CELL_ALPHA));
+    Mask wide = !delta & (alpha >= pick(camera_ray, (Float)(params->cell_alpha), (Float)(LATER_CELL_ALPHA)));
 #if TRANSMISSION
     wide &= b.transmission == 0.0f;
 #endif

@@ -371,7 +371,7 @@ def _sparse(settings: Settings) -> Feature:
 
 
 def _cell_layers(settings: Settings, glossy: bool) -> Feature:
-    """Return whether what coats and metals reflect has cells of its own."""
+    """Return whether what coats and metals reflect is shared where that is wide."""
     if settings.path_filter != "hash_grid":
         return Feature(0, f"path_filter is {settings.path_filter}")
     if not settings.cell_layers:
@@ -411,7 +411,9 @@ def _cells(settings: Settings, glossy: bool, sky: bool) -> Feature:
     elif settings.filter_sky and sky:
         light = "indirect light and what is even of the sky"
     if glossy:
-        return Feature(2, f"{name}: shares {light} of diffuse bases")
+        layers = _cell_layers(settings, glossy).value
+        surfaces = "diffuse bases and wide reflections" if layers else "diffuse bases"
+        return Feature(2, f"{name}: shares {light} of {surfaces}")
     return Feature(1, f"{name}: shares {light}; every material is matt")
 
 

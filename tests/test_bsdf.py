@@ -487,7 +487,7 @@ def test_reflectance_is_about_that_of_the_samples(device, layers):
     plain = {name: b for name, b in MATERIALS.items() if b.transmission == 0.0}
     plain["copper"] = Bsdf(roughness=0.6, metallic=1.0, base_color=(0.9, 0.5, 0.0))
     surfaces = [b.record() for b in plain.values()]
-    least_alphas = [1.0 if name == "lambert" else b.alpha for name, b in plain.items()]
+    least_alphas = [0.0 if name == "lambert" else b.alpha for name, b in plain.items()]
     if layers:
         surfaces += [
             layered(Bsdf(roughness=0.6), sheen=(0.4, 0.2, 0.1), roughness=0.5),

@@ -16,6 +16,7 @@ from psf_cl.plan import make_plan
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.model import Material
 from psf_cl.settings import Settings
+from psf_cl.stages.cells import parameters
 
 LAYERS = {**FILTER, "filter_vertex": "1", "filter_direct": False, "cell_layers": True}
 PARTED = {**LAYERS, "cell_directions": 4}
@@ -120,6 +121,31 @@ def test_a_path_that_goes_on_by_a_coat_shares_at_a_later_vertex(device):
     assert image.mean() == pytest.approx(truth.mean(), rel=0.02)
 
 
+def test_a_cell_is_narrow_beside_reflections_that_are_shared():
+    scene = build([floor(1.0, COATED)], camera((0, 1, 3), (0, 0, 0), 60), (512, 512))
+    told = parameters(scene, Settings(cell_size=24.0), 512 * 512)
+    # One and a half of the angle of a cell: 24 pixels of 60 degrees in 512.
+    assert told["cell_alpha"] ** 0.5 == pytest.approx(0.285, abs=1e-3)
+    wide = build([floor(1.0, COATED)], camera((0, 1, 3), (0, 0, 0), 60), (512, 256))
+    assert parameters(wide, Settings(), 1)["cell_alpha"] == pytest.approx(
+        2 * parameters(scene, Settings(), 1)["cell_alpha"]
+    )
+
+
+def test_matt_surfaces_have_no_parts_of_directions(device):
+    """One cell for all of a matt floor, whatever is told apart of the metal beside it."""
+    parts = [(floor(50.0, lambertian(0.5)))]
+    far = transform.translation((0, -900.0, 0))
+    scene = build(
+        [*parts, (primitives.quad(), far, METAL)],
+        camera((0, 2, 0.001), (0, 0, 0), 60),
+        environment=1.0,
+    )
+    opened = renderer(device, scene, **{**PARTED, "cell_jitter": False})
+    opened = patched(opened, cell_width=1e30, cell_alpha=0.01, cell_flags=0)
+    assert image_of(opened, 4).stats["cells"]["cells_per_pass"] == 1
+
+
 def test_kinds_of_surfaces_have_cells_of_their_own(lane_device):
     alpha = np.exp2(np.linspace(-9, 0, 256, dtype=np.float32))
     metal = (np.arange(256) % 2).astype(np.float32)
@@ -155,7 +181,6 @@ def test_sharing_what_is_glossy_takes_noise_away(device, material):
 
 
 def test_reflections_that_are_sharper_than_a_cell_stay_with_their_pixels(device):
-    """From a distance at which a pixel sees half of all directions nothing is wide enough."""
     scene = room(COATED)
     ways = {**LAYERS, "filter_restore": False, "cell_jitter": False}
     images = [
@@ -169,7 +194,7 @@ def test_reflections_that_are_sharper_than_a_cell_stay_with_their_pixels(device)
 
 @pytest.mark.parametrize("layers", [False, True])
 def test_the_screen_filter_gets_what_bases_reflect_of_shared_light(device, layers):
-    """A ball of no neighbours: the picture is that of the cells, whatever is told apart."""
+    """Nothing is lost between what bases reflect, which is averaged, and the rest."""
     scene = room(COATED, METAL)
     ways = {**LAYERS, "cell_layers": layers, "filter_restore": False, "cell_size": 4.0}
     plain = render(device, scene, 16, **ways).rgb

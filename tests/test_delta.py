@@ -40,7 +40,8 @@ def test_a_mirror_under_a_sky_has_no_noise_and_no_shadow_rays(device):
 
 
 @pytest.mark.slow
-def test_nothing_that_others_know_changes_what_mirrors_and_glass_show(device):
+@pytest.mark.parametrize("cell_size", [16.0, 1e-3])
+def test_nothing_that_others_know_changes_what_mirrors_and_glass_show(device, cell_size):
     light = glowing(20.0)
     scene = still_life(MIRROR, GLASS, light=light, environment=0.3)
     plain = render(device, scene, 8, max_depth=8)
@@ -50,6 +51,7 @@ def test_nothing_that_others_know_changes_what_mirrors_and_glass_show(device):
         8,
         max_depth=8,
         path_filter="hash_grid",
+        cell_size=cell_size,
         screen_filter="path_space",
         light_sampling="photon",
     )

@@ -74,7 +74,9 @@ def test_an_end_that_nobody_asked_for_is_a_failure(play, code):
     assert f"code {code}" in play((code, "why", {})).failure
 
 
-@pytest.mark.parametrize(("signal", "code"), [("TERM", -11), ("TERM", -15), ("INT", -2)])
+@pytest.mark.parametrize(
+    ("signal", "code"), [("TERM", -11), ("TERM", -15), ("INT", -2), ("INT", -9)]
+)
 def test_a_stop_that_is_not_handled_is_a_failure(play, signal, code):
     parts = [(0, "", {0: GREY}), (code, "", {0: GREY})]
     assert f"code {code}" in play(*parts, stops=((signal, 1.0),)).failure

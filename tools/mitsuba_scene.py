@@ -64,7 +64,7 @@ def opaque(scene: Scene) -> Scene:
 def plain(scene: Scene) -> Scene:
     """Return the scene with materials that Mitsuba's own plugins have too, and without cut-outs.
 
-    That are matt ones without a coat, metals and clear glass.
+    These are matt ones without a coat, metals and clear glass.
     """
     materials = tuple(
         m if m.metallic == 1.0 or _is_clear(m) else replace(m, specular=0.0, metallic=0.0)
@@ -268,7 +268,11 @@ def _own_bsdf(material: Material, textures: tuple[Texture, ...]) -> dict[str, An
         bsdf: dict[str, Any] = glass
     elif _is_diffuse(material):
         bsdf = {"type": "diffuse", "reflectance": color}
-    elif material.metallic == 1.0 and min(material.base_color) == 1.0:
+    elif (
+        material.metallic == 1.0
+        and min(material.base_color) == 1.0
+        and material.base_color_texture < 0
+    ):
         bsdf = {"type": "roughconductor", "material": "none", "specular_reflectance": color}
         bsdf |= microfacets
     else:

@@ -170,7 +170,7 @@ def run_round(now: Round, folder: Path) -> Outcome:
             path.unlink()  # The next part may come less far: which is the last would not be known.
         code, text = _render([*again, *_resume(state)], name, seconds)
         outcome.stops += code != 0
-        if code in (0, 130, -signal.SIGKILL):
+        if code in (0, 130) or (name == "KILL" and code == -signal.SIGKILL):
             outcome.failure = _difference(now, folder, code == 0) if now.frames else ""
         else:
             outcome.failure = f"code {code}: {text}"

@@ -264,16 +264,17 @@ static inline Vec3 reflectance(Bsdf b, LobeChances chances)
 #endif
 }
 
-/// The least alpha of what reflects light beside the base; 1 where nothing does.
+/// The least alpha of what reflects light beside the base, sheen as of 1; 0 where nothing does.
 static inline Float least_alpha(Bsdf b)
 {
     const Mask mirrors = (b.metallic > 0.0f) | (b.f0 > 0.0f) | (b.specular > 0.0f);
-    Float least = pick(mirrors, b.alpha, (Float)(1.0f));
 #if LAYERS
-    least = pick(mirrors, min(least, b.alpha_y), least);
+    Float least = pick(mirrors, min(b.alpha, b.alpha_y), (Float)(1.0f));
     least = pick(b.coat > 0.0f, min(least, b.coat_alpha), least);
+    return pick(mirrors | (b.coat > 0.0f) | (max3(b.sheen) > 0.0f), least, (Float)(0.0f));
+#else
+    return pick(mirrors, b.alpha, (Float)(0.0f));
 #endif
-    return least;
 }
 
 /// Share of `f`, which eval_bsdf gave for wo and wi, that the diffuse base has.

@@ -52,7 +52,7 @@ static inline UInt with_direction(UInt ng, uint side, Vec3 wo, UInt random)
 }
 
 /// The packed normal `ng` with the kind of a surface, so that mirrors share no light with matt surfaces beside them:
-/// whether it is a metal, and which power of two its GGX `alpha` comes next to.
+/// whether it is a metal, and which power of two its GGX `alpha` lies above.
 static inline UInt with_gloss(UInt ng, Mask metal, Float alpha)
 {
     // Of alphas from 2^-8 to 1.

@@ -103,13 +103,13 @@
 #error "CACHE must be 0 or 1 (paths end where a cell knows what a surface reflects)"
 #endif
 #ifndef CELLS
-#error "CELLS must be 0, 1 (all of a vertex's light is shared) or 2 (that of its diffuse base)"
+#error "CELLS must be 0, 1 (all of a vertex's light is shared) or 2 (a part of it)"
 #endif
 #ifndef MATERIAL_CELLS
 #error "MATERIAL_CELLS must be 0 or 1 (later vertices fetch what textures give once a cell)"
 #endif
 #ifndef CELL_LAYERS
-#error "CELL_LAYERS must be 0 or 1 (what coats and metals reflect has cells of its own)"
+#error "CELL_LAYERS must be 0 or 1 (what coats and metals reflect is shared where it is wide)"
 #endif
 #ifndef AOV_BOUNCES
 #error "AOV_BOUNCES must be 0 or 1"

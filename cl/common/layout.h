@@ -348,7 +348,7 @@
 #define PATH_END_13 PATH_END_12
 #endif
 #if CELLS >= 2
-#define PATH_SHARE_R (PATH_END_13 + 0u) // part of what comes from beyond the vertex that its diffuse base reflects
+#define PATH_SHARE_R (PATH_END_13 + 0u) // part of what comes from beyond the vertex that is shared
 #define PATH_SHARE_G (PATH_END_13 + 1u)
 #define PATH_SHARE_B (PATH_END_13 + 2u)
 #define PATH_LIGHT_SHARE_R (PATH_END_13 + 3u) // the same of the shadow ray
@@ -496,7 +496,7 @@ typedef struct {
     uint cell_flags; // CELL_JITTER, CELL_NEAR, CELL_IDENTITY
     float cell_width; // edge of a cell in the first pass, m per m of the path
     uint cell_directions; // parts of directions that cells of gloss tell apart, a side
-    float cell_alpha; // least GGX alpha of coats whose light the first surface shares
+    float cell_alpha; // least GGX alpha of coats and metals that share at the first surface
     float cell_shrink; // exponent of the number of the pass in the edge of a cell
     float cell_steps; // fixed-point steps of a sum of radiance per unit, a power of two
     float cell_limit; // radiance from which a sample is too large for the sums
@@ -799,7 +799,7 @@ typedef struct {
     uint shape; // 1 + its number, SHAPE_MOVES; 0 if nothing is seen
     float ns[3]; // unit, shading normal
     float gate[3]; // throughput there, times the reflectance of the diffuse base
-    float share[3]; // part of what comes from beyond it that its diffuse base reflects
+    float share[3]; // part of what comes from beyond it, or its cell, that its base reflects
     float before[3]; // where it was in the frame before
 } Seen;
 

@@ -117,7 +117,7 @@ PARAMS = Record(
     uint cell_flags - CELL_JITTER, CELL_NEAR, CELL_IDENTITY
     float cell_width - edge of a cell in the first pass, m per m of the path
     uint cell_directions - parts of directions that cells of gloss tell apart, a side
-    float cell_alpha - least GGX alpha of coats whose light the first surface shares
+    float cell_alpha - least GGX alpha of coats and metals that share at the first surface
     float cell_shrink - exponent of the number of the pass in the edge of a cell
     float cell_steps - fixed-point steps of a sum of radiance per unit, a power of two
     float cell_limit - radiance from which a sample is too large for the sums
@@ -492,7 +492,7 @@ SEEN = Record(
     uint shape - 1 + its number, SHAPE_MOVES; 0 if nothing is seen
     float ns[3] - unit, shading normal
     float gate[3] - throughput there, times the reflectance of the diffuse base
-    float share[3] - part of what comes from beyond it that its diffuse base reflects
+    float share[3] - part of what comes from beyond it, or its cell, that its base reflects
     float before[3] - where it was in the frame before
     """),
 )
@@ -934,7 +934,7 @@ OPTIONAL_PATH_FIELDS = (
         "CELLS",
         2,
         (
-            ("share_r", "part of what comes from beyond the vertex that its diffuse base reflects"),
+            ("share_r", "part of what comes from beyond the vertex that is shared"),
             ("share_g", ""),
             ("share_b", ""),
             ("light_share_r", "the same of the shadow ray"),
