@@ -95,6 +95,21 @@ def test_launches_keep_their_own_arguments(device, fill):
     np.testing.assert_array_equal(device.read(out)[:5], 748)
 
 
+def test_kernels_of_launches_that_are_gone_are_used_again(device, fill):
+    """Each that is made costs memory for good."""
+    program, out = fill
+    given = {"out": out, "count": 100, "value": 1.0, "offset": 0}
+    one, other = (program.bind("fill", **given) for _ in range(2))
+    gone = one.kernel
+    assert gone is not other.kernel
+    one(100)
+    del one
+    again = program.bind("fill", **given | {"value": 2.0, "count": 10})
+    assert again.kernel is gone
+    again(10)
+    np.testing.assert_array_equal(device.read(out), [709] * 10 + [708] * 90)
+
+
 def test_unknown_kernels_are_refused(fill):
     program, out = fill
     with pytest.raises(TypeError, match=r"include_test\.cl: empty: no such kernel"):

@@ -97,6 +97,27 @@ def test_a_traceback_is_a_failure(play):
     assert "Traceback" in play(*parts, stops=(("INT", 1.0),)).failure
 
 
+def test_what_a_stop_leaves_is_looked_at(play):
+    bad = GREY.copy()
+    bad[0, 0, 0] = np.nan
+    parts = (0, "", {0: GREY}), (130, "", {0: bad})
+    assert "finite" in play(*parts, stops=(("TERM", 1.0),)).failure
+
+
+@pytest.mark.parametrize(
+    ("sums", "growth", "bad"),
+    [
+        ({}, 0.0, False),
+        ({"failures": ["seed 1"]}, 0.0, True),
+        ({"resumed": 0}, 0.0, True),
+        ({}, float("nan"), True),
+        ({}, 1e5, True),
+    ],
+)
+def test_sums_that_are_bad_are_told(soak, sums, growth, bad):
+    assert soak.is_bad({"failures": [], "stops": 100, "resumed": 50} | sums, growth) == bad
+
+
 def test_a_frame_that_was_whole_has_to_stay(play):
     dark = 0.5 * GREY
     whole = (0, "", {3: GREY, 4: GREY, 5: GREY})

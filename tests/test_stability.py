@@ -235,13 +235,15 @@ def test_a_case_has_a_calm_one_or_says_why_there_is_none(tool):
         ({"error": 0.01}, "too noisy to tell"),
         ({"largest": 4.1}, "a pixel is too bright"),
         ({"seconds": 2.1}, "it is too slow"),
-        ({"load": 0.9}, "0.9 of the table are full, not 0.99"),
+        ({"loads": {"cells": 0.9}}, "0.9 of the cells are full, not 0.99"),
+        ({"loads": {"cells": 0.99, "guide": 0.5}}, ""),
         ({"otherwise": ("FEW is 1, not 0: few triangles",)}, "FEW is 1, not 0: few triangles"),
     ],
 )
 def test_each_number_of_a_row_can_fail(tool, monkeypatch, change, why):
     case = next(case for case in tool.CASES if case.name == "a table 99 % full")
-    calm = tool.Picture(0, 0, 1.0, 0.0, 1.0, 64, 64, 1.0, "by power", {}, np.ones((8, 8)), 0.99)
+    calm = tool.Picture(0, 0, 1.0, 0.0, 1.0, 64, 64, 1.0, "by power", {}, np.ones((8, 8)))
+    calm = dataclasses.replace(calm, loads={"cells": 0.99})
     seen = dataclasses.replace(calm, **change)
     bench = tool.Bench(None, 8, 1, timed=True)
     monkeypatch.setattr(bench, "render", lambda one, *_: seen if one is case else calm)

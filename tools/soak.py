@@ -5,17 +5,21 @@ as a user would, in a process of its own: once without a stop; and once more, st
 again by kill -9, SIGTERM or SIGINT, or left alone, and resumed from its checkpoint.  Of a scene
 that moves it renders some frames, which have no checkpoint: the next begins anew.  A round fails
 if a process ends in a traceback or by a signal that it should have handled, a pixel is not finite,
-the two images differ in a bit, a frame that was whole when the process was stopped is another one,
-or something is left in the folder.  The round of a seed is always the same; ``--state`` keeps the
-next seed and the sums, so that a soak goes on in parts.
+also of what a stop leaves, the two images differ in a bit, a frame that was whole when the process
+was stopped is another one, or something is left in the folder.  The round of a seed is always the
+same; ``--state`` keeps the next seed and the sums, so that a soak goes on in parts.
 
-The memory of long renders is watched too: of one process that renders scene after scene.
+The memory of long renders is watched too: of one process that renders all still scenes with all
+presets again and again.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import ctypes
+import gc
+import itertools
 import json
 import os
 import random
@@ -25,14 +29,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from psf_cl.cli.common import positive_number
+from psf_cl.cli.common import positive_integer, positive_number
 from psf_cl.errors import InputError
 from psf_cl.files import write_whole
 from psf_cl.image import read_exr
@@ -58,8 +62,13 @@ FIRST_STOP, MEAN_STOP = 1.0, 1.5
 #: Numbers that a round may set a setting to: ends of ranges take too long for many rounds.
 LARGEST = 64.0
 
-#: Growth of the memory of a process that renders scene after scene, beyond its first scenes.
-MOST_GROWTH = 64 << 20
+#: Growth of a process that renders picture after picture, bytes a picture; and of these the first,
+#: as often as there are scenes and presets, which compile programs and fill pools.
+MOST_GROWTH = 16 << 10
+WARM_UPS = 2
+
+#: Stops after which some checkpoint has to have been there.
+FEW_STOPS = 20
 
 
 @dataclass(frozen=True)
@@ -142,11 +151,13 @@ class Outcome:
         failure: what went wrong; empty if nothing did.
         refused: whether there was too little memory for it, which was said.
         stops: signals that a process got before it was done.
+        resumed: parts that went on from a checkpoint.
     """
 
     failure: str = ""
     refused: bool = False
     stops: int = 0
+    resumed: int = 0
 
 
 def run_round(now: Round, folder: Path) -> Outcome:
@@ -170,8 +181,9 @@ def run_round(now: Round, folder: Path) -> Outcome:
             path.unlink()  # The next part may come less far: which is the last would not be known.
         code, text = _render([*again, *_resume(state)], name, seconds)
         outcome.stops += code != 0
+        outcome.resumed += state.exists()
         if code in (0, 130) or (name == "KILL" and code == -signal.SIGKILL):
-            outcome.failure = _difference(now, folder, code == 0) if now.frames else ""
+            outcome.failure = _difference(now, folder, code == 0)
         else:
             outcome.failure = f"code {code}: {text}"
         if "Traceback" in text:
@@ -198,7 +210,7 @@ def _difference(now: Round, folder: Path, done: bool) -> str:
     """Compare the images that were stopped with the whole ones; return what is wrong.
 
     Args:
-        done: whether all have to be there.  Else the last may hold fewer samples.
+        done: whether all have to be there.  Else the last, or only one, may hold fewer samples.
     """
     ends = [f"_{frame:02d}.exr" for frame in range(*now.frames)] if now.frames else [".exr"]
     there = [end for end in ends if (folder / f"stopped{end}").exists()]
@@ -244,27 +256,37 @@ def _handles(process: int) -> bool:
     return bool(caught >> (signal.SIGTERM - 1) & 1)
 
 
-def memory_growth(count: int) -> int:
-    """Return how much a process grows that renders ``count`` pictures one after another, bytes."""
+def memory_growth(rounds: int) -> float:
+    """Return how much a process grows that renders one picture after another, bytes a picture.
+
+    Args:
+        rounds: of all scenes and presets, after those that warm it up.
+    """
     from psf_cl.device.device import open_device
     from psf_cl.renderer import Renderer
 
     device, sizes = open_device(), []
-    for number in range(count):
-        preset = list(PRESETS)[number % len(PRESETS)]
-        scene = load_scene(ROOT / "scenes" / "cornell_box.toml", size=(64, 64))
-        with contextlib.closing(
-            Renderer(scene, resolve({}, scene.path, preset), device)
-        ) as renderer:
-            renderer.render(spp=16)
-            renderer.image()
-        sizes.append(_resident())
-    assert device.allocated_bytes == 0, "device memory is left"
-    # Presets compile their programs once.
-    return sizes[-1] - sizes[min(2 * len(PRESETS), count - 1)]
+    for _ in range(WARM_UPS + rounds):
+        for name, preset in itertools.product(STILL, PRESETS):
+            scene = load_scene(SCENES / name, size=(64, 64))
+            with contextlib.closing(
+                Renderer(scene, resolve({}, scene.path, preset), device)
+            ) as renderer:
+                renderer.render(spp=4)
+                renderer.image()
+            if device.allocated_bytes:
+                raise AssertionError(f"{device.allocated_bytes} bytes of the device are left")
+            sizes.append(_resident())
+    warm = sizes[len(STILL) * len(PRESETS) * WARM_UPS :]
+    return float(np.polyfit(range(len(warm)), warm, 1)[0])
 
 
 def _resident() -> int:
+    gc.collect()
+    # What is free but not given back goes up and down by more than anything that could leak.
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
     except OSError:
@@ -279,9 +301,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, help="the first round; default: where --state ended")
     parser.add_argument("--state", type=Path, help="file that keeps the sums")
     parser.add_argument("--count", type=int, default=1 << 60, help="rounds at most")
-    parser.add_argument("--pictures", type=int, default=24, help="of the watch on memory")
+    parser.add_argument(
+        "--memory-rounds", type=positive_integer, default=4, help="of the watch on memory"
+    )
     args = parser.parse_args(argv)
-    sums = {"next_seed": 0, "rounds": 0, "refused": 0, "stops": 0, "seconds": 0.0, "failures": []}
+    sums = dict.fromkeys(("next_seed", "rounds", "refused", "stops", "resumed"), 0)
+    sums |= {"seconds": 0.0, "failures": []}
     if args.state is not None and args.state.exists():
         sums |= json.loads(args.state.read_text())
     if args.seed is not None:
@@ -299,18 +324,24 @@ def main(argv: Sequence[str] | None = None) -> int:
         sums["rounds"] += 1
         sums["refused"] += outcome.refused
         sums["stops"] += outcome.stops
+        sums["resumed"] += outcome.resumed
         sums["seconds"] += time.monotonic() - last
         last = time.monotonic()
         if args.state is not None:
             write_whole(args.state, json.dumps(sums, indent=2).encode())
-    growth = memory_growth(args.pictures) if args.pictures else 0
-    flat = growth < MOST_GROWTH
+    growth = memory_growth(args.memory_rounds)
     print(
         f"{sums['rounds']} rounds, {sums['refused']} refused for their memory, "
-        f"{sums['stops']} stops, {sums['seconds']:.0f} s: "
-        f"{len(sums['failures'])} failures; memory grew by {growth / 2**20:.1f} MiB"
+        f"{sums['stops']} stops, {sums['resumed']} parts resumed, {sums['seconds']:.0f} s: "
+        f"{len(sums['failures'])} failures; memory grew by {growth / 2**10:.1f} KiB a picture"
     )
-    return int(bool(sums["failures"]) or not flat)
+    return int(is_bad(sums, growth))
+
+
+def is_bad(sums: Mapping[str, Any], growth: float) -> bool:
+    """Say whether anything failed, nothing was ever resumed, or memory is not flat."""
+    lost = sums["stops"] >= FEW_STOPS and not sums["resumed"]
+    return bool(sums["failures"]) or lost or not growth <= MOST_GROWTH
 
 
 if __name__ == "__main__":

@@ -51,6 +51,13 @@ SPP = 64
 UNBIASED, BIASED = 0.002, 0.02
 #: Of the mean, with the standard errors: what is allowed more tells nothing.
 MOST_ALLOWED = 0.03
+#: Hash tables by their names in the statistics, and the buffers of their keys.
+TABLES = {
+    "cells": "cell_keys",
+    "guide": "guide_keys",
+    "cache": "cache_keys",
+    "materials": "material_keys",
+}
 #: How far the part of a table that is full may be from what is wanted.
 LOAD_SLACK = 0.005
 #: Processor time, of that of the calm case.
@@ -106,7 +113,7 @@ class Picture:
         rays: with photons.
         seconds: processor time of rendering, of all threads.
         lights: how they were picked.
-        load: part of the table of cells that was full; None without one.
+        loads: part of the hash tables that was full, by their names in the statistics.
         otherwise: features of the plan that are not what the case is about, and why.
         pixels: luminance of the pixels, 0 where they are not finite: ``(height, width)``.
     """
@@ -122,7 +129,7 @@ class Picture:
     lights: str
     counters: Mapping[str, Any]
     pixels: np.ndarray
-    load: float | None = None
+    loads: Mapping[str, float] = dataclasses.field(default_factory=dict)
     otherwise: tuple[str, ...] = ()
 
     def ns(self, per: str) -> float:
@@ -205,8 +212,12 @@ def part_of(
         device.wait()
         seconds = time.process_time() - start
         planned = renderer.plan.features
+        keys = {buffer.name for buffer in renderer.plan.buffers}
+        image = renderer.image()
         return dataclasses.replace(
-            summed_up(renderer.image(), seconds),
+            summed_up(image, seconds),
+            # A planned table of which nothing is told is an error, not a table that is full.
+            loads={name: image.stats[name]["load"] for name in TABLES if TABLES[name] in keys},
             lights=planned["LIGHT_SAMPLING"].reason,
             otherwise=tuple(
                 f"{name} is {planned[name].value}, not {value}: {planned[name].reason}"
@@ -245,7 +256,6 @@ def summed_up(image: Image, seconds: float) -> Picture:
         lights="",
         counters=counters,
         pixels=pixels,
-        load=counters.get("cells load"),
     )
 
 
@@ -312,9 +322,14 @@ class Bench:
             "a pixel is too bright": not seen.largest <= most + allowed,
             "too noisy to tell": not allowed <= MOST_ALLOWED * abs(truth),
             "it is too slow": not isinstance(ratio, str) and not ratio <= MOST_TIME,
-            f"{seen.load} of the table are full, not {case.load}": None
-            not in (case.load, seen.load)
-            and not abs(seen.load - case.load) <= LOAD_SLACK,
+        }
+        failures |= {
+            f"{load:.5g} of the {name} are full, not {case.loads[name]:.5g}": not abs(
+                load - case.loads[name]
+            )
+            <= LOAD_SLACK
+            for name, load in seen.loads.items()
+            if name in case.loads
         }
         why = "; ".join([text for text, failed in failures.items() if failed] + [*seen.otherwise])
         return row | {

@@ -30,11 +30,14 @@ LONG = 1000
 TINY_CELLS = {"cell_size": 1e-3, "guide_cell_size": 1e-3, "photon_cell": 1e-6}
 HUGE_CELLS = dict.fromkeys(TINY_CELLS, 1e6)
 
+#: Paths of any preset end where a cache knows what a surface reflects.
+CACHE = {"termination": "cache", "cache_trace": 0.0}
+
+#: Hash tables that a case of one slot fills.
+ALL_FULL = dict.fromkeys(("cells", "guide", "cache"), 1.0)
+
 #: Why no time is compared of pictures of so few pixels.
 FEW_PIXELS = "a pass of few samples takes as long as its launches"
-
-#: Why none is compared of lights that are found in a tree.
-MANY_LEVELS = "each choice goes down 17 levels, not one: docs/many_lights.md has the time"
 
 #: What says how large hash tables and the map of photons are.
 SIZES = (
@@ -69,7 +72,8 @@ class Case:
         refused: presets whose settings do not go with these.
         features: values that the plan has to have, that it is a case of what it says.
         slots: of every hash table, and cells of the map of photons, if not as many as usual.
-        load: part of the table of cells that has to be full, where there is one, to 0.005.
+        loads: part of tables that has to be full, by their names in the statistics, to 0.005;
+            where a preset has them.
     """
 
     name: str
@@ -88,7 +92,7 @@ class Case:
     refused: tuple[str, ...] = ()
     features: Mapping[str, int] = field(default_factory=dict)
     slots: int | None = None
-    load: float | None = None
+    loads: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if (self.calm is None) != bool(self.untimed):
@@ -269,10 +273,15 @@ def with_a_million_in_a_point(parts: dict[str, Part]) -> dict[str, Part]:
     return {**parts, "heap": (heap, np.eye(4), parts["walls"][2])}
 
 
-def with_many_lights(parts: dict[str, Part]) -> dict[str, Part]:
-    """Cut the lamp into 2^17 triangles."""
+def with_many_lights(parts: dict[str, Part], cuts: int = 256) -> dict[str, Part]:
+    """Cut the lamp into 2 * cuts^2 triangles: 2^17."""
     _, matrix, material = parts["lamp"]
-    return {**parts, "lamp": (subdivided(256), matrix, material)}
+    return {**parts, "lamp": (subdivided(cuts), matrix, material)}
+
+
+def with_lights(parts: dict[str, Part]) -> dict[str, Part]:
+    """Cut the lamp into as many triangles as scenes of many lights have, 2^9."""
+    return with_many_lights(parts, 16)
 
 
 def with_dim_light(parts: dict[str, Part]) -> dict[str, Part]:
@@ -469,22 +478,21 @@ CASES: tuple[Case, ...] = (
     room_case("coplanar overlaps", change=with_overlaps),
     room_case("a million triangles in a point", change=with_a_million_in_a_point),
     room_case("2^17 lights", change=with_many_lights),
-    room_case(
-        "2^17 lights, a tree of them",
-        None,
-        untimed=MANY_LEVELS,
-        change=with_many_lights,
-        settings={"light_sampling": "hierarchy"},
-        features={"LIGHT_SAMPLING": 1},
-    ),
-    room_case(
-        "2^17 lights, photons of them",
-        None,
-        untimed=MANY_LEVELS,
-        change=with_many_lights,
-        settings={"light_sampling": "photon"},
-        features={"LIGHT_SAMPLING": 2},
-        refused=("mlt",),
+    # What finds them goes down a level for each power of two.
+    *(
+        room_case(
+            f"{count} lights, {what} of them",
+            f"2^9 lights, {what} of them",
+            change=change,
+            settings={"light_sampling": name},
+            features={"LIGHT_SAMPLING": value},
+            refused=refused,
+        )
+        for what, name, value, refused in (
+            ("a tree", "hierarchy", 1, ()),
+            ("photons", "photon", 2, ("mlt",)),
+        )
+        for count, change in (("2^9", with_lights), ("2^17", with_many_lights))
     ),
     room_case("lights 1e6 : 1", change=with_dim_light),
     Case("no light", lambda edge: room(edge, without_light), 0.0, "room"),
@@ -553,7 +561,7 @@ CASES: tuple[Case, ...] = (
         size=(9, 7),
         spp=16,
         settings=TINY_CELLS,
-        load=63 / 64,
+        loads={"cells": 63 / 64},
         untimed=FEW_PIXELS,
     ),
     furnace_case(
@@ -563,11 +571,19 @@ CASES: tuple[Case, ...] = (
         size=(80, 60),
         settings=TINY_CELLS,
         slots=4096,
-        load=0.99,
+        loads={"cells": 0.99},
     ),
-    furnace_case("tables of one slot", "depth 3", depth=3, slots=1, load=1.0),
-    room_case("tables of one slot in the room", slots=1, load=1.0),
-    # The guide learns by means, which have no rate: what it may decide goes from nothing to all.
+    furnace_case("tables of one slot", "depth 3", depth=3, slots=1, loads=ALL_FULL),
+    room_case("tables of one slot in the room", slots=1, loads=ALL_FULL),
+    *(
+        room_case(name, "a cache", settings=CACHE, refused=("mlt",), **values)
+        for name, values in (
+            ("a cache", {}),
+            ("a cache of one slot", {"slots": 1, "loads": ALL_FULL}),
+        )
+    ),
+    # The guide learns by means, which have no rate: what it may decide goes from nothing to 99 %,
+    # the most that leaves every direction possible.
     room_case("what was learned decides nothing", settings={"guide_share": 0.0}),
     room_case("what was learned decides 99 %", settings={"guide_share": 0.99}),
     room_case("1 photon", settings={"photons": 1}),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import time
 import warnings
+import weakref
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -85,6 +86,7 @@ class Program:
         defines: every macro that it was built with.
         is_warm: whether it was warmed up.
         seconds: that building took, down to machine code where it was warmed up.
+        idle: kernels by name whose launches are gone, for the next ones.
     """
 
     def __init__(
@@ -108,6 +110,31 @@ class Program:
             raise DeviceError(f"{file} does not build on {device.name}: {error}") from error
         self.seconds = time.perf_counter() - start
         self.is_warm = False
+        self.idle: dict[str, list[cl.Kernel]] = {}
+        self._parameters: dict[str, list[tuple[str, str, bool]]] = {}
+
+    def kernel(self, name: str) -> cl.Kernel:
+        """Return a kernel that nobody else uses; its arguments have to be set, all of them.
+
+        One of a launch that is gone, if there is any: each that pyopencl makes costs a millisecond
+        and some memory that it never gives back, for it writes Python code for it.
+        """
+        try:
+            return self.idle[name].pop()
+        except (KeyError, IndexError):
+            return cl.Kernel(self.program, name)
+
+    def parameters(self, name: str) -> list[tuple[str, str, bool]]:
+        """Return name, type and whether it is a pointer of each of a kernel's parameters."""
+        if name not in self._parameters:
+            kernel = self.kernel(name)
+            self._parameters[name] = parameters_of(kernel)
+            self.give_back(name, kernel)
+        return self._parameters[name]
+
+    def give_back(self, name: str, kernel: cl.Kernel) -> None:
+        """Keep a kernel that is not used any more."""
+        self.idle.setdefault(name, []).append(kernel)
 
     def warm_up(self, *kernels: str) -> None:
         """Launch ``kernels`` once on zeros, for PoCL generates code at the first launch.
@@ -122,11 +149,12 @@ class Program:
             zeros = device.memory(_WARM_UP_BYTES)
             cl.enqueue_fill_buffer(queue, zeros, np.uint8(0), 0, _WARM_UP_BYTES)
             for name in kernels:
-                kernel = cl.Kernel(self.program, name)
-                for index, (_, spelled, pointer) in enumerate(parameters_of(kernel)):
+                kernel = self.kernel(name)
+                for index, (_, spelled, pointer) in enumerate(self.parameters(name)):
                     kernel.set_arg(index, zeros if pointer else _SCALARS[spelled](0))
                 group = device.traits.group
                 cl.enqueue_nd_range_kernel(queue, kernel, (group,), (group,))
+                self.give_back(name, kernel)
             queue.finish()
         self.is_warm = True
         self.seconds += time.perf_counter() - start
@@ -147,7 +175,7 @@ class Program:
         Raises:
             TypeError: the kernel wants something that is not among them.
         """
-        names = [name for name, _, _ in parameters_of(cl.Kernel(self.program, kernel))]
+        names = [name for name, _, _ in self.parameters(kernel)]
         given = {name: buffers[name] for name in names if name in buffers}
         return self.bind(kernel, **given, **scalars)
 
@@ -198,13 +226,15 @@ class Launch:
         self.label = f"{program.file}: {name}"
         try:
             # A kernel object holds its arguments, so each binding has its own.
-            self.kernel = cl.Kernel(program.program, name)
+            self.kernel = program.kernel(name)
         except cl.LogicError as error:
             raise TypeError(f"{self.label}: no such kernel") from error
         self.parameters = {
             name: (index, spelled, pointer)
-            for index, (name, spelled, pointer) in enumerate(parameters_of(self.kernel))
+            for index, (name, spelled, pointer) in enumerate(program.parameters(name))
         }
+        # What still runs has arguments of its own.
+        weakref.finalize(self, program.give_back, name, self.kernel).atexit = False
         missing = self.parameters.keys() - arguments.keys()
         if missing:
             raise TypeError(f"{self.label}: missing {', '.join(sorted(missing))}")
