@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 from dataclasses import replace
 from pathlib import Path
 
+import kernel_timing as tool
 import numpy as np
 import pytest
 from scene_builder import build, camera, floor, glowing, inside_out, lambertian
@@ -28,14 +28,6 @@ from psf_cl.traits import DeviceTraits
 ROOT = Path(__file__).resolve().parents[1]
 MS = 1_000_000
 CONDITIONS = {"scene": "box.toml", "size": [8, 8]}
-
-
-@pytest.fixture(scope="module")
-def tool():
-    spec = importlib.util.spec_from_file_location("timing_tool", ROOT / "tools/kernel_timing.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def small_scene(lens_radius=0.0):
@@ -358,7 +350,7 @@ def test_a_full_build_leaves_what_is_on_as_it_is():
     assert features["LENS"].reason == make_plan(lit, Settings()).features["LENS"].reason
 
 
-def test_repetitions_of_a_real_render_add_up(device, tool):
+def test_repetitions_of_a_real_render_add_up(device):
     opened = Renderer(small_scene(), Settings(), narrow(device, profiling=True))
     watch = tool.Stopwatch(opened, keep_intervals=True)
     watch.warm_up(0.05)
@@ -384,7 +376,7 @@ def test_repetitions_of_a_real_render_add_up(device, tool):
     opened.close()
 
 
-def test_a_trace_has_a_limit_and_counts_what_is_beyond(tool, monkeypatch):
+def test_a_trace_has_a_limit_and_counts_what_is_beyond(monkeypatch):
     monkeypatch.setattr(tool, "TRACE_LIMIT", 3)
     watch = tool.Stopwatch(None, keep_intervals=True)
     for at in range(0, 4, 2):
@@ -400,7 +392,7 @@ def test_the_device_tells_how_fast_it_copies():
     assert opened.allocated_bytes == before
 
 
-def test_the_tool_shows_kernels_saves_and_compares(device, tool, tmp_path, capsys, monkeypatch):
+def test_the_tool_shows_kernels_saves_and_compares(device, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(tool.Device, "copy_bandwidth", lambda self: 1e10)
     traits = replace(device.traits, lanes=1, block=8, slots=64)
     monkeypatch.setattr(
@@ -439,7 +431,7 @@ def test_the_tool_shows_kernels_saves_and_compares(device, tool, tmp_path, capsy
         (["--trace", "nowhere/a.json"], "there is no folder"),
     ],
 )
-def test_bad_arguments_are_refused(tool, arguments, message, tmp_path, monkeypatch):
+def test_bad_arguments_are_refused(arguments, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match=re.escape(message)):
         tool.main([str(ROOT / "scenes" / "cornell_box.toml"), *arguments])

@@ -21,7 +21,7 @@ from psf_cl.scene.model import Environment
 from psf_cl.settings import resolve
 
 ROOT = os.environ.get("PSF_CL_SHARED_SCENES", "")
-KINDS = ("interiors", "game", "geometry")
+KINDS = ("interiors", "game", "geometry", "materials")
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 
 pytestmark = [

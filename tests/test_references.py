@@ -1,8 +1,8 @@
 """References: their mean, variance and halves against NumPy; stopping, resuming, disagreement."""
 
-import importlib.util
 from pathlib import Path
 
+import make_references as tool
 import numpy as np
 import pytest
 
@@ -11,15 +11,6 @@ from psf_cl.measure.references import RunningReference
 
 ROOT = Path(__file__).resolve().parents[1]
 SHAPE = (24, 32, 3)
-
-
-@pytest.fixture(scope="module")
-def tool():
-    path = ROOT / "tools" / "make_references.py"
-    spec = importlib.util.spec_from_file_location("make_references", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def renders(count, seed=0):
@@ -71,7 +62,7 @@ def test_halves_agree_when_renders_are_independent_and_only_then():
     assert running_of(together).halves_agreement().rms > 2.0
 
 
-def test_the_tool_stops_goes_on_and_tells_the_truth(tool, device, tmp_path, capsys):
+def test_the_tool_stops_goes_on_and_tells_the_truth(device, tmp_path, capsys):
     out = tmp_path / "ref.exr"
     scene = str(ROOT / "scenes" / "cornell_box.toml")
     base = [scene, "--size", "24x16", "--spp", "16", "-o", str(out)]

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 from pathlib import Path
 
 import numpy as np
 import pytest
+from make_references import main as make_references
 
 from psf_cl.cli.main import main
 from psf_cl.errors import InputError
@@ -69,20 +69,13 @@ def test_flicker_is_the_variance_of_independent_frames_where_the_truth_rests():
     assert np.isnan(sequences.flicker(steps(1.0, 2.0), moving))
 
 
-def make_references(*arguments):
-    path = ROOT / "tools" / "make_references.py"
-    spec = importlib.util.spec_from_file_location("make_references", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.main([str(argument) for argument in arguments])
-
-
 def test_references_of_frames_are_made_and_rules_compared(device, tmp_path, capsys):
     """A lamp goes out in frame 2 of the sequence: who never forgets has not caught up."""
     size = ("--size", "24x18")
     frames = ("--frames", "6:12")
     references = tmp_path / "####.exr"
-    make_references(LIGHT_OFF, *size, *frames, "--spp", 32, "--seeds", 2, "-o", references)
+    many = ("--spp", "32", "--seeds", "2")
+    make_references([LIGHT_OFF, *size, *frames, *many, "-o", str(references)])
     assert sorted(path.name for path in tmp_path.glob("*.exr")) == [
         f"{frame:04}.exr" for frame in range(6, 12)
     ]

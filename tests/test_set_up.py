@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 import types
 from pathlib import Path
 
 import pyopencl as cl
 import pytest
+import set_up
 
 from psf_cl.device import selftest
 from psf_cl.device.advice import driver_command
@@ -17,14 +17,6 @@ from psf_cl.device.drivers import driver_problems
 from psf_cl.errors import DeviceError
 
 ROOT = Path(__file__).resolve().parents[1]
-
-
-@pytest.fixture
-def set_up():
-    spec = importlib.util.spec_from_file_location("set_up", ROOT / "tools" / "set_up.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture
@@ -182,7 +174,7 @@ def test_the_advice_fits_the_system(ids, command):
     assert command in driver_command(ids)
 
 
-def test_set_up_stops_with_the_command_where_it_may_install_nothing(set_up, monkeypatch, capsys):
+def test_set_up_stops_with_the_command_where_it_may_install_nothing(monkeypatch, capsys):
     monkeypatch.setenv("PSF_CL_NO_SYSTEM_INSTALL", "1")
     monkeypatch.setattr(set_up, "working_device", lambda: ("", ["P: D: wrong results"]))
     monkeypatch.setattr(set_up, "pip", lambda *arguments: 1)
@@ -196,7 +188,7 @@ def test_set_up_stops_with_the_command_where_it_may_install_nothing(set_up, monk
     assert "sudo dnf install pocl" in output.err
 
 
-def test_set_up_takes_a_wheel_that_does_not_work_away_again(set_up, monkeypatch):
+def test_set_up_takes_a_wheel_that_does_not_work_away_again(monkeypatch):
     done = []
     monkeypatch.setenv("PSF_CL_NO_SYSTEM_INSTALL", "1")
     monkeypatch.setattr(set_up, "working_device", lambda: ("", ["broken"]))

@@ -2,32 +2,21 @@
 
 from __future__ import annotations
 
-import importlib
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import soak
 
 from psf_cl.image import Image, write_exr
 
-ROOT = Path(__file__).resolve().parents[1]
 GREY = np.full((2, 3, 3), 0.5, np.float32)
 
 
-@pytest.fixture(scope="module")
-def soak():
-    """Return ``tools/soak.py`` as a module."""
-    sys.path.insert(0, str(ROOT / "tools"))
-    try:
-        yield importlib.import_module("soak")
-    finally:
-        sys.path.remove(str(ROOT / "tools"))
-
-
 @pytest.fixture
-def play(soak, monkeypatch, tmp_path):
+def play(monkeypatch, tmp_path):
     """Return a function that runs a round whose renders write and return what it is told."""
 
     def run(*parts, stops=(), frames=None, memory=None):
@@ -83,7 +72,7 @@ def test_a_stop_that_is_not_handled_is_a_failure(play, signal, code):
 
 
 @pytest.mark.parametrize(("handler", "known"), [("signal.SIG_DFL", False), ("print", True)])
-def test_a_process_without_a_handler_is_told(soak, handler, known):
+def test_a_process_without_a_handler_is_told(handler, known):
     code = f"import signal, sys; signal.signal(signal.SIGTERM, {handler}); print(flush=True)"
     command = [sys.executable, "-c", f"{code}; sys.stdin.read()"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
@@ -114,7 +103,7 @@ def test_what_a_stop_leaves_is_looked_at(play):
         ({}, 1e5, True),
     ],
 )
-def test_sums_that_are_bad_are_told(soak, sums, growth, bad):
+def test_sums_that_are_bad_are_told(sums, growth, bad):
     assert soak.is_bad({"failures": [], "stops": 100, "resumed": 50} | sums, growth) == bad
 
 
@@ -138,7 +127,7 @@ def test_too_little_memory_is_no_failure_if_it_is_said(play):
     assert play((1, "error: 70 MiB of 64", {})).failure
 
 
-def test_a_seed_stands_for_one_round(soak):
+def test_a_seed_stands_for_one_round():
     assert soak.round_of(5) == soak.round_of(5)
     rounds = [soak.round_of(seed) for seed in range(40)]
     assert any(each.frames for each in rounds)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import itertools
 import subprocess
 import sys
 from pathlib import Path
 
+import check_kernels as jobs
 import numpy as np
 import pytest
+import stability as tool
+import stability_cases as cases
 from scene_builder import build, camera, floor, glowing, inside_out, lambertian, render, renderer
 
 from psf_cl.plan import make_plan
@@ -23,16 +25,6 @@ from psf_cl.settings import PRESETS, Settings, resolve
 
 ROOT = Path(__file__).resolve().parents[1]
 VIEW = camera((0.0, 0.0, 0.95), (0.0, -0.2, -1.0), 60.0)
-
-
-@pytest.fixture(scope="module")
-def tool():
-    """Return ``tools/stability.py`` as a module."""
-    sys.path.insert(0, str(ROOT / "tools"))
-    try:
-        yield importlib.import_module("stability")
-    finally:
-        sys.path.remove(str(ROOT / "tools"))
 
 
 def furnace(albedo=0.5, depth=16, view=VIEW):
@@ -156,7 +148,7 @@ def test_roulette_does_not_take_the_step_into_glass_for_a_loss(device, ior, radi
     assert noise[0] < 1.5 * noise[1]
 
 
-def test_all_pairs_of_values_meet_in_some_row(tool):
+def test_all_pairs_of_values_meet_in_some_row():
     values = {"a": [1, 2, 3], "b": ["x", "y"], "c": [False, True], "d": [0.5], "e": list(range(7))}
 
     def refusal(row):
@@ -171,7 +163,7 @@ def test_all_pairs_of_values_meet_in_some_row(tool):
     assert refused == ["no"]
 
 
-def test_a_table_without_a_case_or_a_column_is_not_whole(tool):
+def test_a_table_without_a_case_or_a_column_is_not_whole():
     named = {"case": "room", "preset": "pt", "verdict": "ok", "why": ""}
     whole = dict.fromkeys(tool.COLUMNS, 1.0) | named
     assert tool.missing_rows([whole], [("room", "pt")]) == []
@@ -199,7 +191,7 @@ what was learned decides nothing, what was learned decides 99 %, 1 photon, 1e7 p
 """
 
 
-def test_no_extreme_that_was_promised_is_missing(tool):
+def test_no_extreme_that_was_promised_is_missing():
     names = [case.name for case in tool.CASES]
     assert len(set(names)) == len(names)
     assert set(EXTREMES.strip().replace("\n", ", ").split(", ")) <= set(names)
@@ -212,7 +204,7 @@ def test_no_extreme_that_was_promised_is_missing(tool):
     assert chosen == {1, 2}
 
 
-def test_a_case_has_a_calm_one_or_says_why_there_is_none(tool):
+def test_a_case_has_a_calm_one_or_says_why_there_is_none():
     case = tool.CASES[0]
     with pytest.raises(ValueError, match="expected a calm case, or why there is none"):
         dataclasses.replace(case, calm=None)
@@ -240,7 +232,7 @@ def test_a_case_has_a_calm_one_or_says_why_there_is_none(tool):
         ({"otherwise": ("FEW is 1, not 0: few triangles",)}, "FEW is 1, not 0: few triangles"),
     ],
 )
-def test_each_number_of_a_row_can_fail(tool, monkeypatch, change, why):
+def test_each_number_of_a_row_can_fail(monkeypatch, change, why):
     case = next(case for case in tool.CASES if case.name == "a table 99 % full")
     calm = tool.Picture(0, 0, 1.0, 0.0, 1.0, 64, 64, 1.0, "by power", {}, np.ones((8, 8)))
     calm = dataclasses.replace(calm, loads={"cells": 0.99})
@@ -251,7 +243,7 @@ def test_each_number_of_a_row_can_fail(tool, monkeypatch, change, why):
     assert (row["verdict"], row["why"]) == ("FAILED" if why else "ok", why)
 
 
-def test_tables_are_as_small_as_a_case_wants_them(tool, device):
+def test_tables_are_as_small_as_a_case_wants_them(device):
     scene, settings = lit_floor(), resolve({}, "a case", "game")
 
     def slots():
@@ -266,8 +258,7 @@ def test_tables_are_as_small_as_a_case_wants_them(tool, device):
         assert slots() == usual
 
 
-def test_the_part_of_a_picture_around_a_ball_is_that_of_its_outline(tool):
-    cases = importlib.import_module("stability_cases")
+def test_the_part_of_a_picture_around_a_ball_is_that_of_its_outline():
     square = np.array([[0, 0], [2, 0], [2, 2], [0, 2], [1, 1], [1, 0], [0.5, 1.5]])
     assert cases.convex_area(square) == 4.0
     # A sphere of radius 1 is a cone around its middle, seen somewhat wider than the ball of facets.
@@ -276,7 +267,7 @@ def test_the_part_of_a_picture_around_a_ball_is_that_of_its_outline(tool):
     assert 0.0 < cases.around_ball() - (1.0 - sphere) < 0.01
 
 
-def test_the_largest_pixel_is_that_of_all_samples_also_where_they_come_in_parts(tool, monkeypatch):
+def test_the_largest_pixel_is_that_of_all_samples_also_where_they_come_in_parts(monkeypatch):
     def part_of(device, scene, settings, spp, *others):
         pixels = np.zeros((1, tool.SEEDS))
         pixels[0, settings.seed] = 16.0
@@ -287,7 +278,7 @@ def test_the_largest_pixel_is_that_of_all_samples_also_where_they_come_in_parts(
     assert tool.picture(None, None, settings, 64).largest == 16.0 / tool.SEEDS
 
 
-def test_the_table_tells_good_from_bad(tool, device, monkeypatch, tmp_path, capsys):
+def test_the_table_tells_good_from_bad(device, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(tool, "open_device", lambda name: device)
     case = tool.CASES[[case.name for case in tool.CASES].index("depth 1")]
     cases = [case, dataclasses.replace(case, name="depth 1, wrong", truth=1.05)]
@@ -309,8 +300,7 @@ def test_the_table_tells_good_from_bad(tool, device, monkeypatch, tmp_path, caps
     assert page.count("<tr") == 6 and page.count("class=failed") == 3
 
 
-def test_jobs_of_the_simulator_are_renders_that_are_not_refused(tool):
-    jobs = importlib.import_module("check_kernels")
+def test_jobs_of_the_simulator_are_renders_that_are_not_refused():
     planned = set()
     for name, job in jobs.JOBS.items():
         settings = resolve({}, name, job.preset, jobs.SMALL | dict(job.settings))

@@ -2,36 +2,23 @@
 
 from __future__ import annotations
 
-import importlib
 import itertools
 import re
 import time
 from pathlib import Path
 
+import measuring
 import numpy as np
 import pytest
+import scaling
+import statistics_cost
 
 import psf_cl
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
-@pytest.fixture(autouse=True)
-def _tools(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
-
-
-@pytest.fixture
-def measuring():
-    return importlib.import_module("measuring")
-
-
-@pytest.fixture
-def scaling():
-    return importlib.import_module("scaling")
-
-
-def test_every_second_round_runs_in_reverse_order(measuring):
+def test_every_second_round_runs_in_reverse_order():
     calls = []
     numbers = itertools.count()
 
@@ -47,7 +34,7 @@ def test_every_second_round_runs_in_reverse_order(measuring):
     assert measured.values == {"a": [0.0, 5.0, 6.0], "b": [1.0, 4.0, 7.0], "c": [2.0, 3.0, 8.0]}
 
 
-def test_cores_tell_work_from_waiting(measuring):
+def test_cores_tell_work_from_waiting():
     def work():
         end = time.process_time() + 0.05
         while time.process_time() < end:
@@ -62,7 +49,7 @@ def test_cores_tell_work_from_waiting(measuring):
     assert cores["wait"] < 0.5 * cores["work"]
 
 
-def test_ratios_are_of_rounds_and_not_of_medians(measuring):
+def test_ratios_are_of_rounds_and_not_of_medians():
     quotients = measuring.ratio([2.0, 30.0, 8.0], [1.0, 10.0, 2.0])
     assert (quotients.median, quotients.low, quotients.high) == (3.0, 2.0, 4.0)
     assert quotients.text(1) == "3.0 (2.0-4.0)"
@@ -70,7 +57,7 @@ def test_ratios_are_of_rounds_and_not_of_medians(measuring):
         measuring.ratio([1.0, 2.0], [1.0])
 
 
-def test_rate_counts_only_the_samples_of_its_own_time(measuring):
+def test_rate_counts_only_the_samples_of_its_own_time():
     class Pretended:
         """Makes 1000 samples in 10 ms, after 5000 in the past."""
 
@@ -96,7 +83,7 @@ def test_rate_counts_only_the_samples_of_its_own_time(measuring):
 
 
 @pytest.mark.parametrize("count", [1000, 10000])
-def test_terrains_of_any_fineness_are_one_surface(scaling, count):
+def test_terrains_of_any_fineness_are_one_surface(count):
     mesh, fine = scaling.terrain(count), scaling.terrain(4 * 10**4)
     assert abs(len(mesh.triangles) / count - 1.0) < 0.05
     corners = mesh.positions[mesh.triangles]
@@ -111,7 +98,7 @@ def test_terrains_of_any_fineness_are_one_surface(scaling, count):
 
 
 @pytest.mark.parametrize("count", [1000, 20000])
-def test_soups_have_one_area_for_any_number_of_triangles(scaling, count):
+def test_soups_have_one_area_for_any_number_of_triangles(count):
     mesh = scaling.soup(count)
     corners = mesh.positions[mesh.triangles].astype(np.float64)
     edges = corners - np.roll(corners, 1, axis=1)
@@ -125,7 +112,8 @@ def test_soups_have_one_area_for_any_number_of_triangles(scaling, count):
 
 def test_captured_rays_go_back_into_a_pool_and_hit_what_brute_force_hits(device):
     pytest.importorskip("mitsuba")
-    ray_speed = importlib.import_module("ray_speed")
+    import ray_speed
+
     scene = psf_cl.load_scene(ROOT / "scenes" / "cornell_box.toml", size=(32, 32))
     ours = ray_speed.Ours(scene, 1024)
     rays = {part.name: part for part in ours.capture()}
@@ -162,8 +150,7 @@ def _brute_force(corners: np.ndarray, origins: np.ndarray, directions: np.ndarra
 
 
 def test_what_statistics_cost_is_told_with_an_interval(capsys):
-    tool = importlib.import_module("statistics_cost")
     scene = str(ROOT / "scenes" / "cornell_box.toml")
-    assert tool.main([scene, "--size", "16x16", "--spp", "1", "--rounds", "3"]) == 0
+    assert statistics_cost.main([scene, "--size", "16x16", "--spp", "1", "--rounds", "3"]) == 0
     median, low, high = map(float, re.findall(r"\d+\.\d{4}", capsys.readouterr().out))
     assert 0.0 < low <= median <= high

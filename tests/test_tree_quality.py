@@ -1,28 +1,14 @@
 """The tool that compares trees counts what each ray visits."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+import tree_quality as tool
 
 from psf_cl.device.bvh import build_bvh
 
-ROOT = Path(__file__).parents[1]
-
-
-@pytest.fixture(scope="module")
-def tool():
-    spec = importlib.util.spec_from_file_location("tree_quality", ROOT / "tools/tree_quality.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
 
 @pytest.mark.parametrize("any_hit", [False, True])
-def test_a_ray_that_misses_the_only_box_visits_no_block(tool, device, any_hit):
+def test_a_ray_that_misses_the_only_box_visits_no_block(device, any_hit):
     corners = np.array([0, 0, 0, 1, 0, 0, 0, 1, 0], np.float32)
     positions = device.upload("positions", corners)
     bvh = build_bvh(device, positions, 1)
