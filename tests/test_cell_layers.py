@@ -198,8 +198,12 @@ def test_the_screen_filter_gets_what_bases_reflect_of_shared_light(device, layer
     scene = room(COATED, METAL)
     ways = {**LAYERS, "cell_layers": layers, "filter_restore": False, "cell_size": 4.0}
     plain = render(device, scene, 16, **ways).rgb
-    filtered = render(device, scene, 16, **ways, screen_filter="path_space").rgb
+    ways |= {"screen_filter": "path_space"}
+    filtered = render(device, scene, 16, **ways).rgb
     assert filtered.mean() == pytest.approx(plain.mean(), rel=0.02)
+    # Averaged over nothing but themselves, both parts are together what pixels were.
+    alone = render(device, scene, 16, **ways, screen_radius=0.0).rgb
+    np.testing.assert_allclose(alone, plain, rtol=1e-5, atol=1e-6)
 
 
 def test_same_bits_for_any_pool(device):
