@@ -204,6 +204,8 @@ def part_of(
     """Render once and sum up; errors are those of ``picture``."""
     with contextlib.closing(Renderer(scene, settings, device, outputs=outputs)) as renderer:
         prepare(renderer)
+        # Trees are built meanwhile, which samples have no part in.
+        device.wait()
         start = time.process_time()
         if not renderer.render(
             spp=spp, progress=lambda now: time.process_time() - start < MOST_SECONDS

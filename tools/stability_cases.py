@@ -477,20 +477,20 @@ CASES: tuple[Case, ...] = (
     room_case("duplicates", change=with_duplicates),
     room_case("coplanar overlaps", change=with_overlaps),
     room_case("a million triangles in a point", change=with_a_million_in_a_point),
-    room_case("2^17 lights", change=with_many_lights),
-    # What finds them goes down a level for each power of two.
+    # What finds one of them goes down a level of a tree for each power of two.
     *(
         room_case(
-            f"{count} lights, {what} of them",
-            f"2^9 lights, {what} of them",
+            f"{count} lights{how}",
+            f"2^9 lights{how}",
             change=change,
-            settings={"light_sampling": name},
-            features={"LIGHT_SAMPLING": value},
+            settings=settings,
+            features=features,
             refused=refused,
         )
-        for what, name, value, refused in (
-            ("a tree", "hierarchy", 1, ()),
-            ("photons", "photon", 2, ("mlt",)),
+        for how, settings, features, refused in (
+            ("", {}, {}, ()),
+            (", a tree of them", {"light_sampling": "hierarchy"}, {"LIGHT_SAMPLING": 1}, ()),
+            (", photons of them", {"light_sampling": "photon"}, {"LIGHT_SAMPLING": 2}, ("mlt",)),
         )
         for count, change in (("2^9", with_lights), ("2^17", with_many_lights))
     ),
