@@ -338,6 +338,7 @@ static inline void look_up_samples(
 #endif
 #if RESTORE
     __global Lost *film_lost,
+    __global float *film_shared,
 #endif
 #if CELL_HISTORY
     __global SharedLight *shared,
@@ -388,10 +389,12 @@ static inline void look_up_samples(
     const float sign = pass_is_in_half((place->pass - params->first_pass) / params->splits) ? -1.0f : 1.0f;
     const Float brightness = sign * luminance(lost);
     float lane_lost[4][W];
+    float lane_shared[W];
     store_lanes(lost.x, lane_lost[0]);
     store_lanes(lost.y, lane_lost[1]);
     store_lanes(lost.z, lane_lost[2]);
     store_lanes(brightness, lane_lost[3]);
+    store_lanes(luminance(light), lane_shared);
 #endif
 #if AOV_CELLS
     uint lane_slot[W];
@@ -445,6 +448,8 @@ static inline void look_up_samples(
             const float4 sum = vload4(0, sums) + added;
             vstore4((sum - vload4(0, sums)) - added, 0, excess);
             vstore4(sum, 0, sums);
+            // It is only compared with noise: that it stands still after some millions does no harm.
+            film_shared[own_pixel] += lane_shared[i];
         }
 #endif
 #if AOV_CELLS
@@ -462,7 +467,7 @@ static inline void look_up_samples(
 ///
 /// reads   beyond, vertices, cell_keys, cells, full_buckets, seen; kept_*, cell_changes; with WALLS near_cells,
 ///         geometry
-/// writes  samples, base, film_lost, film_cells, shared_light; counters.unfiltered_samples (atomic)
+/// writes  samples, base, film_lost, film_shared, film_cells, shared_light; counters.unfiltered_samples (atomic)
 kernel void look_up_cells(
     __global const Params *params,
     __global const Beyond *beyond,
@@ -481,6 +486,7 @@ kernel void look_up_cells(
 #endif
 #if RESTORE
     __global Lost *film_lost,
+    __global float *film_shared,
 #endif
 #if CELL_HISTORY
     __global SharedLight *shared_light,
@@ -504,7 +510,7 @@ kernel void look_up_cells(
                             seen + place.samples, base + 4 * place.samples,
 #endif
 #if RESTORE
-                            film_lost,
+                            film_lost, film_shared,
 #endif
 #if CELL_HISTORY
                             shared_light,

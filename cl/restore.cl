@@ -8,7 +8,7 @@
 //
 // Where a rare bright sample is missing all looks darker than its cell, and sure: without care its light
 // would be taken from there, and not be given to where it is, for there is noise.  So no pixel counts as surer
-// than what is around, relative to its light, and nothing becomes negative.
+// than what is around, relative to the light that it shares, and nothing becomes negative.
 //
 // James, Stein: Estimation with Quadratic Loss, 1961 (shrinking by the part that is noise).
 
@@ -29,6 +29,15 @@ static inline Float sure_part(Float square, Float noise)
     return pick(sure, square - noise, (Float)(0.0f)) / max(square, (Float)(1e-37f));
 }
 
+// What pixels show beside the light that they share, as lamps do, tells nothing of its noise: so many times that
+// light they have at most.
+#define MOST_LIGHT 4.0f
+
+// The part of the pixels that noise comes from up to which it passes for that of all around; where more of them
+// have a share in it, it is known well, and pixels are believed to have less: ever less, down to LEAST_LIFT of it.
+#define FEW_NOISY 0.1f
+#define LEAST_LIFT 0.2f
+
 // Of the mean noise of the first window, the part that is the least of each pixel.
 #define LEAST_NOISE 0.5f
 
@@ -36,13 +45,6 @@ static inline Float sure_part(Float square, Float noise)
 #define TILES_AROUND 2u
 
 static inline uint tiles_along(uint extent) { return (extent + RESTORE_TILE - 1u) / RESTORE_TILE; }
-
-/// Luminance of a pixel of the picture; what is negative has none.
-static inline float light_of(__global const float *restored, uint pixel)
-{
-    const float3 rgb = vload3(0, restored + 4u * pixel);
-    return max(LUMINANCE_RED * rgb.x + LUMINANCE_GREEN * rgb.y + LUMINANCE_BLUE * rgb.z, 0.0f);
-}
 
 /// `back`, but no more of it than leaves a pixel that is not negative so.
 static inline float kept_positive(float back, float restored) { return max(back, -max(restored, 0.0f)); }
@@ -56,20 +58,22 @@ static inline void place_in_crop(__global const Params *params, UInt pixel, UInt
 }
 
 /// Turn sums into means, with what counts as noise of their squares in `difference`, and take the picture from the
-/// film.  One work item a pixel.
+/// film, with its `light`, of which that is the noise: what was shared, and some more.  One work item a pixel.
 ///
 /// The noise shows in the difference between two halves of the samples; `tilt` is what one half has more of
 /// all, and 1 where nothing can be told.  Of few samples the halves often look too much alike, for bright ones
 /// are rare: their noise is taken for larger.  `caution` variances count as noise.
 ///
-/// reads   film, film_lost
-/// writes  unrestored, restored
+/// reads   film, film_lost, film_shared
+/// writes  unrestored, restored, light
 kernel void take_lost(
     __global const Params *params,
     __global const FilmSum *film,
     __global const Lost *film_lost,
+    __global const float *film_shared,
     __global Lost *unrestored,
     __global float *restored,
+    __global float *light,
     const float tilt,
     const float caution)
 {
@@ -90,17 +94,20 @@ kernel void take_lost(
     const float difference = apart / count - tilt * mean;
     const float variance = difference * difference / max(1.0f - tilt * tilt, 1e-6f);
     unrestored[pixel].difference = caution * variance * (1.0f + 4.0f / max(count - 1.0f, 1.0f));
+    const float shown = max(weights[0] * restored[4 * pixel] + weights[1] * restored[4 * pixel + 1]
+                                + weights[2] * restored[4 * pixel + 2], 0.0f);
+    light[pixel] = min(shown, MOST_LIGHT * film_shared[pixel] / count);
 }
 
-/// Add up the noise of a tile of the crop, and the square of its light: of its mean luminance, for each pixel.
+/// Add up the noise of a tile of the crop; the square of its mean light, for each pixel; and the roots of its noise.
 /// One work item a tile.
 ///
-/// reads   unrestored, restored
+/// reads   unrestored, light
 /// writes  tiles
 kernel void sum_tiles(
     __global const Params *params,
     __global const Lost *unrestored,
-    __global const float *restored,
+    __global const float *light,
     __global float *tiles)
 {
     const uint tile = get_global_id(0);
@@ -113,25 +120,29 @@ kernel void sum_tiles(
     const uint right = min(left + RESTORE_TILE, params->crop_width);
     const uint bottom = min(top + RESTORE_TILE, params->crop_height);
     float noise = 0.0f;
-    float light = 0.0f;
+    float roots = 0.0f;
+    float sum = 0.0f;
     for (uint y = top; y < bottom; ++y)
         for (uint x = left; x < right; ++x) {
             const uint pixel = pixel_entry_of(params, x, y);
             noise += unrestored[pixel].difference;
-            light += light_of(restored, pixel);
+            roots += sqrt(unrestored[pixel].difference);
+            sum += light[pixel];
         }
-    tiles[2u * tile] = noise;
-    tiles[2u * tile + 1u] = light / (float)((right - left) * (bottom - top)) * light;
+    tiles[3u * tile] = noise;
+    tiles[3u * tile + 1u] = sum / (float)((right - left) * (bottom - top)) * sum;
+    tiles[3u * tile + 2u] = roots;
 }
 
-/// Lift the noise of pixels that look surer, for their light, than the tiles around.  One work item a tile.
+/// Lift the noise of pixels that look surer, for their light, than the tiles around, the more the fewer pixels
+/// that noise comes from: by the squared mean root of noise over its mean.  One work item a tile.
 ///
-/// reads   tiles, restored
+/// reads   tiles, light
 /// writes  unrestored
 kernel void lift_noise(
     __global const Params *params,
     __global const float *tiles,
-    __global const float *restored,
+    __global const float *light,
     __global Lost *unrestored)
 {
     const uint tile = get_global_id(0);
@@ -142,20 +153,27 @@ kernel void lift_noise(
     const uint column = tile % across;
     const uint row = tile / across;
     float noise = 0.0f;
-    float light = 0.0f;
+    float squares = 0.0f;
+    float roots = 0.0f;
+    uint count = 0;
     for (uint y = row - min(row, TILES_AROUND); y <= min(row + TILES_AROUND, down - 1u); ++y)
         for (uint x = column - min(column, TILES_AROUND); x <= min(column + TILES_AROUND, across - 1u); ++x) {
-            noise += tiles[2u * (y * across + x)];
-            light += tiles[2u * (y * across + x) + 1u];
+            noise += tiles[3u * (y * across + x)];
+            squares += tiles[3u * (y * across + x) + 1u];
+            roots += tiles[3u * (y * across + x) + 2u];
+            count += min(RESTORE_TILE, params->crop_width - x * RESTORE_TILE)
+                     * min(RESTORE_TILE, params->crop_height - y * RESTORE_TILE);
         }
     // Where squares leave the range of numbers nothing is known: what is infinite passes for all noise.
-    const float relative = isfinite(noise) && isfinite(light) ? noise / max(light, 1e-37f) : FLT_MAX;
+    const float part = roots * roots / max(noise * (float)count, 1e-37f);
+    const float lift = clamp(FEW_NOISY / max(part, 1e-37f), LEAST_LIFT, 1.0f);
+    const float relative = isfinite(noise) && isfinite(squares) ? lift * noise / max(squares, 1e-37f) : FLT_MAX;
     const uint right = min((column + 1u) * RESTORE_TILE, params->crop_width);
     const uint bottom = min((row + 1u) * RESTORE_TILE, params->crop_height);
     for (uint y = row * RESTORE_TILE; y < bottom; ++y)
         for (uint x = column * RESTORE_TILE; x < right; ++x) {
             const uint pixel = pixel_entry_of(params, x, y);
-            const float its_light = light_of(restored, pixel);
+            const float its_light = light[pixel];
             __global Lost *left = &unrestored[pixel];
             // No number where nothing around has any light: fmax leaves that out.
             left->difference = fmax(left->difference, relative * its_light * its_light);

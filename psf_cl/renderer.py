@@ -402,6 +402,7 @@ class Renderer:
             "film_cells",
             "film_half",
             "film_lost",
+            "film_shared",
             "surfaces_seen",
             "shared_light",
             *names,
@@ -1144,10 +1145,11 @@ class Renderer:
         self.restore_launches: dict[str | int, list[tuple[Launch, int]]] = {}
         if program is None:
             return
-        names = ("params", "film", "film_lost", "unrestored", "tiles", "rows", "restored")
-        params, sums, lost, unrestored, tiles, rows, restored = (
+        names = ("params", "film", "film_lost", "film_shared", "mean_light", "unrestored", "tiles")
+        params, sums, lost, shared, light, unrestored, tiles = (
             self.buffers[name] for name in names
         )
+        rows, restored = self.buffers["rows"], self.buffers["restored"]
         pixels = self.plan.pixel_count
         items = -(-pixels // self.plan.traits.lanes)
         state = {"params": params, "unrestored": unrestored}
@@ -1155,6 +1157,8 @@ class Renderer:
             "take_lost",
             film=sums,
             film_lost=lost,
+            film_shared=shared,
+            light=light,
             restored=restored,
             tilt=1.0,
             caution=2.0,
@@ -1163,7 +1167,7 @@ class Renderer:
         self.restore_launches["take"] = [(take, pixels)]
         tile_count = restore.tiles(self.plan.crop[2:])
         self.restore_launches["tiles"] = [
-            (program.bind(name, tiles=tiles, restored=restored, **state), tile_count)
+            (program.bind(name, tiles=tiles, light=light, **state), tile_count)
             for name in ("sum_tiles", "lift_noise")
         ]
         for radius in restore.RADII:

@@ -61,20 +61,27 @@ def model(opened, positive=True):
             back = np.maximum(back, -np.maximum(image, 0))
         return image + back, left - back
 
-    # Nothing looks surer, for its light, than five by five tiles of pixels around.
-    light = np.maximum(image @ LUMINANCE, 0)
+    # Nothing looks surer, for the light that it shares, than five by five tiles of pixels around.
+    shared = picture(opened.device.read(opened.buffers["film_shared"])[:, None] / count)[..., 0]
+    light = np.minimum(np.maximum(image @ LUMINANCE, 0), 4 * shared)
     tile = layout.CONSTANT["RESTORE_TILE"]
     ys, xs = np.mgrid[:height, :width] // tile
     for y in range(-(-height // tile)):
         for x in range(-(-width // tile)):
-            noise = squares = 0.0
+            noise = squares = roots = 0.0
+            pixels = 0
             for j in range(y - 2, y + 3):
                 for i in range(x - 2, x + 3):
                     inside = (ys == j) & (xs == i)
                     noise += variance[inside].sum()
+                    roots += np.sqrt(variance[inside]).sum()
+                    pixels += inside.sum()
                     squares += light[inside].sum() ** 2 / max(inside.sum(), 1)
             here = (ys == y) & (xs == x)
-            lifted[here] = np.maximum(variance[here, 0], noise / squares * light[here] ** 2)
+            # The more pixels have a part in the noise, the more those are believed that do not.
+            noisy = roots**2 / (noise * pixels)
+            relative = np.clip(0.1 / noisy, 0.2, 1.0) * noise / squares
+            lifted[here] = np.maximum(variance[here, 0], relative * light[here] ** 2)
     variance = lifted[..., None]
 
     for radius in (8, 2) if len(passes) < 16 else (8, 4, 2, 1):

@@ -68,8 +68,12 @@ def plan(context: Context) -> StageSpec | None:
             BufferSpec(
                 "film_lost", lost, 2 * pixels, "what averages took from the pixels, and excess"
             ),
+            BufferSpec(
+                "film_shared", np.dtype(np.float32), pixels, "luminance of what came from cells"
+            ),
+            BufferSpec("mean_light", np.dtype(np.float32), pixels, "its mean, and some more", True),
             BufferSpec("unrestored", lost, pixels, "of that, what is not put back yet", True),
-            BufferSpec("tiles", np.dtype(np.float32), 2 * count, "their noise and light", True),
+            BufferSpec("tiles", np.dtype(np.float32), 3 * count, "their noise and light", True),
             BufferSpec("rows", lost, pixels, "the same, summed over rows", True),
             BufferSpec("restored", np.dtype(np.float32), 4 * pixels, "the picture with it", True),
         ),
