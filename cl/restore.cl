@@ -58,14 +58,14 @@ static inline void place_in_crop(__global const Params *params, UInt pixel, UInt
 }
 
 /// Turn sums into means, with what counts as noise of their squares in `difference`, and take the picture from the
-/// film, with its `light`, of which that is the noise: what was shared, and some more.  One work item a pixel.
+/// film, with the light of which that is the noise: what was shared, and some more.  One work item a pixel.
 ///
 /// The noise shows in the difference between two halves of the samples; `tilt` is what one half has more of
 /// all, and 1 where nothing can be told.  Of few samples the halves often look too much alike, for bright ones
 /// are rare: their noise is taken for larger.  `caution` variances count as noise.
 ///
 /// reads   film, film_lost, film_shared
-/// writes  unrestored, restored, light
+/// writes  unrestored, restored, mean_light
 kernel void take_lost(
     __global const Params *params,
     __global const FilmSum *film,
@@ -73,7 +73,7 @@ kernel void take_lost(
     __global const float *film_shared,
     __global Lost *unrestored,
     __global float *restored,
-    __global float *light,
+    __global float *mean_light,
     const float tilt,
     const float caution)
 {
@@ -96,18 +96,18 @@ kernel void take_lost(
     unrestored[pixel].difference = caution * variance * (1.0f + 4.0f / max(count - 1.0f, 1.0f));
     const float shown = max(weights[0] * restored[4 * pixel] + weights[1] * restored[4 * pixel + 1]
                                 + weights[2] * restored[4 * pixel + 2], 0.0f);
-    light[pixel] = min(shown, MOST_LIGHT * film_shared[pixel] / count);
+    mean_light[pixel] = min(shown, MOST_LIGHT * film_shared[pixel] / count);
 }
 
 /// Add up the noise of a tile of the crop; the square of its mean light, for each pixel; and the roots of its noise.
 /// One work item a tile.
 ///
-/// reads   unrestored, light
+/// reads   unrestored, mean_light
 /// writes  tiles
 kernel void sum_tiles(
     __global const Params *params,
     __global const Lost *unrestored,
-    __global const float *light,
+    __global const float *mean_light,
     __global float *tiles)
 {
     const uint tile = get_global_id(0);
@@ -127,7 +127,7 @@ kernel void sum_tiles(
             const uint pixel = pixel_entry_of(params, x, y);
             noise += unrestored[pixel].difference;
             roots += sqrt(unrestored[pixel].difference);
-            sum += light[pixel];
+            sum += mean_light[pixel];
         }
     tiles[3u * tile] = noise;
     tiles[3u * tile + 1u] = sum / (float)((right - left) * (bottom - top)) * sum;
@@ -137,12 +137,12 @@ kernel void sum_tiles(
 /// Lift the noise of pixels that look surer, for their light, than the tiles around, the more the fewer pixels
 /// that noise comes from: by the squared mean root of noise over its mean.  One work item a tile.
 ///
-/// reads   tiles, light
+/// reads   tiles, mean_light
 /// writes  unrestored
 kernel void lift_noise(
     __global const Params *params,
     __global const float *tiles,
-    __global const float *light,
+    __global const float *mean_light,
     __global Lost *unrestored)
 {
     const uint tile = get_global_id(0);
@@ -173,7 +173,7 @@ kernel void lift_noise(
     for (uint y = row * RESTORE_TILE; y < bottom; ++y)
         for (uint x = column * RESTORE_TILE; x < right; ++x) {
             const uint pixel = pixel_entry_of(params, x, y);
-            const float its_light = light[pixel];
+            const float its_light = mean_light[pixel];
             __global Lost *left = &unrestored[pixel];
             // No number where nothing around has any light: fmax leaves that out.
             left->difference = fmax(left->difference, relative * its_light * its_light);

@@ -9,7 +9,7 @@ import numpy as np
 from psf_cl.device import layout
 from psf_cl.features import restores
 from psf_cl.image import Image
-from psf_cl.stages import cells, film, guide, photons, restore
+from psf_cl.stages import cells, film, guide, photons
 
 if TYPE_CHECKING:
     from psf_cl.renderer import Renderer
@@ -149,13 +149,7 @@ def _guide_aovs(renderer: Renderer, partial: bool) -> dict[str, np.ndarray]:
 def _restored(renderer: Renderer, counters: np.ndarray) -> np.ndarray:
     """Return the image with what averages per cell lost, ``(h, w, 3)``."""
     passes = int(counters[layout.COUNTER_INDEX["film_pass"]]) - renderer.scheduler.first
-    take, pixels = renderer.restore_launches["take"][0]
-    tilt = restore.tilt(passes, renderer.settings.splits)
-    take.set(tilt=tilt, caution=restore.caution(passes))
-    take(pixels, film.GROUP)
-    for step in ("tiles", *restore.radii(passes), "pixels"):
-        for launch, items in renderer.restore_launches[step]:
-            launch(items, film.GROUP)
+    renderer.restore(passes, renderer.settings.splits)
     return _in_rows(
         renderer, renderer.device.read(renderer.buffers["restored"]).reshape(-1, 4)[:, :3]
     )

@@ -1058,7 +1058,10 @@ class Renderer:
             programs["seen"].bind_planned("add_seen", self.buffers) if "seen" in programs else None
         )
         self._bind_pictures(programs)
-        self._bind_restore(programs.get("restore"))
+        self.restore: restore.Restore | None = None
+        if "restore" in programs:
+            size = self.plan.crop[2:]
+            self.restore = restore.Restore(programs["restore"], self.buffers, size)
         self.advance = self.film_program.bind_planned("advance_film", self.buffers)
         if self.statistics:
             self.census = self.film_program.bind(
@@ -1140,49 +1143,6 @@ class Renderer:
             self.plan.ring,
         )
         self.add_unfiltered = program.bind_planned("add_unfiltered", self.buffers)
-
-    def _bind_restore(self, program: Program | None) -> None:
-        self.restore_launches: dict[str | int, list[tuple[Launch, int]]] = {}
-        if program is None:
-            return
-        names = ("params", "film", "film_lost", "film_shared", "mean_light", "unrestored", "tiles")
-        params, sums, lost, shared, light, unrestored, tiles = (
-            self.buffers[name] for name in names
-        )
-        rows, restored = self.buffers["rows"], self.buffers["restored"]
-        pixels = self.plan.pixel_count
-        items = -(-pixels // self.plan.traits.lanes)
-        state = {"params": params, "unrestored": unrestored}
-        take = program.bind(
-            "take_lost",
-            film=sums,
-            film_lost=lost,
-            film_shared=shared,
-            light=light,
-            restored=restored,
-            tilt=1.0,
-            caution=2.0,
-            **state,
-        )
-        self.restore_launches["take"] = [(take, pixels)]
-        tile_count = restore.tiles(self.plan.crop[2:])
-        self.restore_launches["tiles"] = [
-            (program.bind(name, tiles=tiles, light=light, **state), tile_count)
-            for name in ("sum_tiles", "lift_noise")
-        ]
-        for radius in restore.RADII:
-            add_up = program.bind("sum_rows", rows=rows, radius=radius, **state)
-            add = program.bind(
-                "restore_windows",
-                rows=rows,
-                restored=restored,
-                radius=radius,
-                is_first=int(radius == restore.RADII[0]),
-                **state,
-            )
-            self.restore_launches[radius] = [(add_up, items), (add, items)]
-        last = program.bind("restore_pixels", restored=restored, **state)
-        self.restore_launches["pixels"] = [(last, items)]
 
     def _bind_chains(self, program: Program | None) -> None:
         self.splat_launches: list[Launch] = []

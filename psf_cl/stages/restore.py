@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from psf_cl.device import layout
+from psf_cl.stages import film
 from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
+
+if TYPE_CHECKING:
+    from psf_cl.device.device import Buffer
+    from psf_cl.device.program import Program
 
 #: Pixels to each side of the windows in which it is looked for, one after the other: of few passes
 #: nothing shows in the ones between.
@@ -79,3 +87,39 @@ def plan(context: Context) -> StageSpec | None:
         ),
         per_pass=True,
     )
+
+
+class Restore:
+    """Makes the picture in ``restored`` of the film and what averages took from it."""
+
+    def __init__(
+        self, program: Program, buffers: Mapping[str, Buffer], size: tuple[int, int]
+    ) -> None:
+        """Bind the kernels; ``size`` are the pixels across and down."""
+        self.pixels, self.tiles = size[0] * size[1], tiles(size)
+        self.per_lanes = -(-self.pixels // program.device.traits.lanes)
+        self.take = program.bind_planned("take_lost", buffers, tilt=1.0, caution=2.0)
+        self.of_tiles = [
+            program.bind_planned(name, buffers) for name in ("sum_tiles", "lift_noise")
+        ]
+        self.of_windows = {
+            radius: (
+                program.bind_planned("sum_rows", buffers, radius=radius),
+                program.bind_planned(
+                    "restore_windows", buffers, radius=radius, is_first=int(radius == RADII[0])
+                ),
+            )
+            for radius in RADII
+        }
+        self.of_pixels = program.bind_planned("restore_pixels", buffers)
+
+    def __call__(self, passes: int, splits: int) -> None:
+        """Enqueue what it takes after so many ``passes``."""
+        self.take.set(tilt=tilt(passes, splits), caution=caution(passes))
+        self.take(self.pixels, film.GROUP)
+        for launch in self.of_tiles:
+            launch(self.tiles, film.GROUP)
+        for radius in radii(passes):
+            for launch in self.of_windows[radius]:
+                launch(self.per_lanes, film.GROUP)
+        self.of_pixels(self.per_lanes, film.GROUP)
