@@ -36,7 +36,7 @@ from typing import Any
 
 import numpy as np
 
-from psf_cl.cli.common import positive_integer, positive_number
+from psf_cl.cli.common import positive_number
 from psf_cl.errors import InputError
 from psf_cl.files import write_whole
 from psf_cl.image import read_exr
@@ -260,7 +260,7 @@ def memory_growth(rounds: int) -> float:
     """Return how much a process grows that renders one picture after another, bytes a picture.
 
     Args:
-        rounds: of all scenes and presets, after those that warm it up.
+        rounds: of all scenes and presets, after those that warm it up; at least two.
     """
     from psf_cl.device.device import open_device
     from psf_cl.renderer import Renderer
@@ -277,8 +277,10 @@ def memory_growth(rounds: int) -> float:
             if device.allocated_bytes:
                 raise AssertionError(f"{device.allocated_bytes} bytes of the device are left")
             sizes.append(_resident())
-    warm = sizes[len(STILL) * len(PRESETS) * WARM_UPS :]
-    return float(np.polyfit(range(len(warm)), warm, 1)[0])
+    # Means of whole rounds: scenes differ in size.
+    pictures = len(STILL) * len(PRESETS)
+    means = np.reshape(sizes, (-1, pictures)).mean(axis=1)[WARM_UPS:]
+    return float(np.polyfit(range(rounds), means, 1)[0]) / pictures
 
 
 def _resident() -> int:
@@ -302,7 +304,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--state", type=Path, help="file that keeps the sums")
     parser.add_argument("--count", type=int, default=1 << 60, help="rounds at most")
     parser.add_argument(
-        "--memory-rounds", type=positive_integer, default=4, help="of the watch on memory"
+        "--memory-rounds",
+        type=int,
+        choices=range(2, 100),
+        metavar="N",
+        default=4,
+        help="of the watch on memory, at least 2",
     )
     args = parser.parse_args(argv)
     sums = dict.fromkeys(("next_seed", "rounds", "refused", "stops", "resumed"), 0)
