@@ -12,6 +12,7 @@
 //
 // James, Stein: Estimation with Quadratic Loss, 1961 (shrinking by the part that is noise).
 
+#include "common/features.h"
 #include "common/lanes.h"
 #include "common/layout.h"
 #include "common/pixels.h"
@@ -64,13 +65,16 @@ static inline void place_in_crop(__global const Params *params, UInt pixel, UInt
 /// all, and 1 where nothing can be told.  Of few samples the halves often look too much alike, for bright ones
 /// are rare: their noise is taken for larger.  `caution` variances count as noise.
 ///
-/// reads   film, film_lost, film_shared
+/// reads   film, film_lost, film_shared; kept
 /// writes  unrestored, restored, mean_light
 kernel void take_lost(
     __global const Params *params,
     __global const FilmSum *film,
     __global const Lost *film_lost,
     __global const float *film_shared,
+#if FIREFLIES
+    __global const float *kept,
+#endif
     __global Lost *unrestored,
     __global float *restored,
     __global float *mean_light,
@@ -81,10 +85,15 @@ kernel void take_lost(
     if (pixel >= params->pixel_count)
         return;
     const float count = (float)max(film[pixel].count, 1u);
+#if FIREFLIES
+    const float part = kept[pixel];
+#else
+    const float part = 1.0f;
+#endif
     float mean = 0.0f;
     const float weights[3] = {LUMINANCE_RED, LUMINANCE_GREEN, LUMINANCE_BLUE};
     for (uint c = 0; c < 3; ++c) {
-        restored[4 * pixel + c] = (film[pixel].sum[c] - film[pixel].lost[c]) / count;
+        restored[4 * pixel + c] = part * ((film[pixel].sum[c] - film[pixel].lost[c]) / count);
         const float sum = film_lost[pixel].rgb[c] - film_lost[params->pixel_count + pixel].rgb[c];
         const float lost = fabs(tilt) < 1.0f ? sum / count : 0.0f;
         unrestored[pixel].rgb[c] = lost;

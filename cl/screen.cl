@@ -32,7 +32,8 @@ kernel void resolve_light(
     const float count = (float)max(film[pixel].count, 1u);
     light[pixel].count = (float)film[pixel].count;
     light[pixel].alpha = 1.0f;
-    light[pixel].square = 0.0f;
+    light[pixel].means = (float)film[pixel].count;
+    light[pixel].square = film[pixel].squares / count + film[pixel].mean * film[pixel].mean;
     light[pixel].change = 0.0f;
     light[pixel].noise = count > 1.0f ? NOISE_OF_MEAN(film_base[pixel].squares, count) : NOISE_UNKNOWN;
     for (uint c = 0; c < 3; ++c) {

@@ -293,10 +293,10 @@ kernel void blend_history(
     noise = pick(count > LEAST_FRAMES * fresh,
                  max(square - mean_luminance * mean_luminance, 0.0f) * fresh / max(count, 1.0f), noise);
 
-    const Float values[11] = {mean.x,      mean.y, mean.z, count,  base_mean.x, base_mean.y,
-                              base_mean.z, alpha,  square, change, noise};
-    float lane[11][W];
-    for (uint c = 0; c < 11; ++c)
+    const Float values[12] = {mean.x,      mean.y, mean.z, count,  base_mean.x, base_mean.y,
+                              base_mean.z, alpha,  square, change, noise,       count * inverse};
+    float lane[12][W];
+    for (uint c = 0; c < 12; ++c)
         store_lanes(values[c], lane[c]);
     const uint lanes = min(params->pixel_count - first, (uint)W);
     for (uint k = 0; k < lanes; ++k) {
@@ -304,7 +304,7 @@ kernel void blend_history(
         vstore8((float8)(lane[0][k], lane[1][k], lane[2][k], lane[3][k], lane[4][k], lane[5][k], lane[6][k],
                          lane[7][k]),
                 0, words);
-        vstore4((float4)(lane[8][k], lane[9][k], lane[10][k], 0.0f), 2, words);
+        vstore4((float4)(lane[8][k], lane[9][k], lane[10][k], lane[11][k]), 2, words);
 #if CELL_HISTORY
         __global float *its = (__global float *)(shared_pixels + first + k);
         vstore4((float4)(lane_parts[0][k], lane_parts[1][k], lane_parts[2][k], lane_parts[3][k]), 0, its);

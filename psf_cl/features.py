@@ -213,6 +213,11 @@ def _features(scene: Scene, settings: Settings, outputs: frozenset[str]) -> dict
         "WALLS": _walls(settings),
         "AOV_CELLS": _aov_cells(settings, outputs),
         "RESTORE": restores(settings),
+        "FIREFLIES": switch(
+            settings.filter_fireflies,
+            "filter_fireflies dims what few samples speak for",
+            "filter_fireflies is false",
+        ),
         "SEEN": _seen(settings, outputs),
         "BASE": _base(settings, glossy),
         "METROPOLIS": switch(
@@ -497,6 +502,8 @@ def all_on(features: dict[str, Feature], settings: Settings) -> dict[str, Featur
     full["AOV_GUIDE"] = features["AOV_GUIDE"]
     # Paths would end elsewhere.
     full["CACHE"] = features["CACHE"]
+    # Pixels would be dimmed.
+    full["FIREFLIES"] = features["FIREFLIES"]
     # Other light would be shared.
     full["CELL_LAYERS"] = features["CELL_LAYERS"]
     # Means of texels would be read.

@@ -47,10 +47,19 @@ def image_of(renderer: Renderer, names: set[str]) -> Image:
     aovs["rgb"] = mean(main)
     if "film_direct" in sums:
         aovs["direct"] = mean(sums["film_direct"][0])
-    if restores(renderer.settings).value and not partial:
-        aovs["rgb"] = _restored(renderer, counters)
-    elif renderer.picture_launches and not partial:
-        aovs["rgb"] = _picture(renderer)
+    if not partial:
+        for launch, items in renderer.weigh_launches:
+            launch(items, film.GROUP)
+        if restores(renderer.settings).value:
+            aovs["rgb"] = _restored(renderer, counters)
+        elif renderer.picture_launches:
+            aovs["rgb"] = _picture(renderer)
+        if "kept" in renderer.buffers:
+            kept = _in_rows(renderer, renderer.device.read(renderer.buffers["kept"])[:, None])
+            if not (restores(renderer.settings).value or renderer.picture_launches):
+                aovs["rgb"] *= kept
+            if "direct" in aovs:
+                aovs["direct"] *= kept
     if "direct" in aovs:
         aovs["indirect"] = aovs["rgb"] - aovs["direct"]
     if "film_features" in sums:

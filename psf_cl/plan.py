@@ -35,6 +35,7 @@ from psf_cl.stages import (
     cells,
     connect,
     film,
+    fireflies,
     guide,
     intersect,
     material_cells,
@@ -276,10 +277,12 @@ def make_plan(
             f"--noise: samples of splits={settings.splits} begin alike, so that they cannot tell "
             "their error; expected splits=1, --spp or --seconds"
         )
-    if halves and restores(settings).value:
+    biased = ["filter_restore"] * restores(settings).value
+    biased += ["filter_fireflies"] * settings.filter_fireflies
+    if halves and biased:
         raise InputError(
-            "--noise: the error of what filter_restore puts back cannot be told from the samples; "
-            "expected filter_restore=false, --spp or --seconds"
+            f"--noise: what {' and '.join(biased)} do to the error cannot be told from the "
+            f"samples; expected {', '.join(f'{name}=false' for name in biased)}, --spp or --seconds"
         )
     if settings.integrator == "metropolis":
         _check_metropolis(outputs, halves)
@@ -396,6 +399,7 @@ def _stages(context: Context) -> tuple[StageSpec, ...]:
         film,
         probes,
         temporal,
+        fireflies,
         screen,
         guide,
         cache,

@@ -403,6 +403,7 @@ class Renderer:
             "film_half",
             "film_lost",
             "film_shared",
+            "kept",
             "surfaces_seen",
             "shared_light",
             *names,
@@ -1099,7 +1100,11 @@ class Renderer:
         self.blend_launches = (
             launches("find_motion", "blend_history") if shared else launches("resolve_light")
         )
-        self.picture_launches = [*self.blend_launches, *launches("filter_screen")]
+        self.weigh_launches = launches("weigh_film")
+        self.picture_launches = [
+            *self.blend_launches,
+            *launches("weigh_light", "hold_light", "filter_screen"),
+        ]
 
     def _bind_cells(self, program: Program | None, history: Program | None) -> None:
         self.cell_launches: list[tuple[Launch, int]] = []

@@ -200,6 +200,10 @@ class Settings:
         False,
         doc="add what averages lost back where it stands out of the noise: consistent",
     )
+    filter_fireflies: bool = _switch(
+        False,
+        doc="dim pixels that are brighter than their samples and neighbours speak for: consistent",
+    )
     cell_size: float = _number(16.0, 1e-3, 1e6, doc="edge of a cell in the first pass, pixels")
     cell_min_count: int = _number(
         0, 0, 1 << 20, doc="samples of a pass below which a cell gives way to one twice as wide"
@@ -324,6 +328,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         # What large cells blur is put back (measured: less error at all times than smaller cells,
         # or cells that shrink, have).
         "filter_restore": True,
+        "filter_fireflies": True,
         "cell_size": 24.0,
         "cell_shrink": False,
     },
@@ -338,6 +343,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "filter_vertex": "1",
         "filter_direct": False,
         "filter_sky": True,
+        "filter_fireflies": True,
         "temporal": "adaptive",
         "screen_filter": "path_space",
     },
@@ -346,6 +352,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 #: What goes with ``integrator=metropolis``: it has no pixel's samples to share, guide or keep.
 METROPOLIS_NEEDS = {
+    "filter_fireflies": False,
     "guiding": "off",
     "indirect_light": "paths",
     "material_cache": "off",

@@ -43,6 +43,7 @@ def statistics_of(renderer: Renderer) -> dict[str, Any]:
         "guide": _guide_statistics(renderer, counters),
         "cache": _cache_statistics(renderer, counters, rays),
         "cells": _cell_statistics(renderer, counters),
+        "fireflies": _firefly_statistics(renderer),
         "materials": _material_statistics(renderer, counters),
         "metropolis": renderer.chains.statistics() if renderer.chains else None,
         "photons": renderer.photon_map.counts() if renderer.photon_map else None,
@@ -90,6 +91,23 @@ def _cache_statistics(
         "ended_paths": layout.whole(counters, "cache_ends") / max(rays["camera"], 1),
         "failed_inserts": int(counters[layout.COUNTER_INDEX["cache_failed"]]),
         "rejected": int(counters[layout.COUNTER_INDEX["cache_rejected"]]),
+    }
+
+
+def _firefly_statistics(renderer: Renderer) -> dict[str, float] | None:
+    """Return which parts of the pixels, and of their light, the last picture holds back."""
+    if "kept" not in renderer.buffers:
+        return None
+    held = 1.0 - renderer.device.read(renderer.buffers["kept"]).astype(np.float64)
+    if held.min() == 1.0:
+        # No picture was made: of one, pixels that are as black as all around keep what they have.
+        held[:] = 0.0
+    film = renderer.device.read(renderer.buffers["film"])
+    light = np.maximum(film["mean"].astype(np.float64), 0.0)
+    whole = light.sum()
+    return {
+        "pixels": float(np.count_nonzero(held)) / len(held),
+        "light": float(held @ light / whole) if whole > 0.0 else 0.0,
     }
 
 

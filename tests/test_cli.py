@@ -489,6 +489,7 @@ def test_plan_follows_the_options(all_features, capsys):
         "CELL_HISTORY",
         "CELL_LAYERS",
         "FEW",
+        "FIREFLIES",
         "GUIDE",
         "INSTANCES",
         "LAYERS",

@@ -265,6 +265,7 @@ def test_every_flag_at_once_renders(wants):
         AOVS,
         path_filter="hash_grid",
         screen_filter="path_space",
+        filter_fireflies=True,
         temporal="adaptive",
         light_sampling="hierarchy",
         guiding="learned",

@@ -168,7 +168,7 @@ def test_light_reflected_more_than_once_is_the_rest_of_the_restored_picture(devi
 
 
 def test_no_error_is_estimated_of_what_goes_back():
-    with pytest.raises(InputError, match="--noise: the error of what filter_restore"):
+    with pytest.raises(InputError, match="--noise: what filter_restore"):
         make_plan(room(), Settings(**RESTORE), halves=True)
 
 

@@ -159,6 +159,9 @@ class Job:
 OUTPUTS = ("albedo", "normal", "depth", "direct", "indirect", "variance", "samples", "motion")
 OUTPUTS_OF_CELLS = ("cells", "occupancy", "cell_count", "cell_variance", "filter_weight")
 
+#: What an estimate of the error asks for.
+AS_SAMPLED = {"filter_restore": False, "filter_fireflies": False}
+
 JOBS = {
     **{f"{preset}, tree": Job(room, preset) for preset in PRESETS},
     **{f"{preset}, list": Job(everything, preset, tree=False) for preset in PRESETS},
@@ -172,10 +175,8 @@ JOBS = {
     "material cache": Job(everything, "pt", {"material_cache": "hash_grid"}, times=(1.0,)),
     "rectangles": Job(room, "pt", {"area_sampling": "solid_angle"}, tree=False),
     "spheres": Job(lantern, "photon"),
-    "range search": Job(
-        room, "psf", {"path_filter": "range_search", "filter_restore": False}, everything=True
-    ),
-    "outputs": Job(everything, "psf", {"filter_restore": False}, tree=False, everything=True),
+    "range search": Job(room, "psf", {"path_filter": "range_search"} | AS_SAMPLED, everything=True),
+    "outputs": Job(everything, "psf", AS_SAMPLED, tree=False, everything=True),
     "outputs of cells": Job(room, "psf", {"cell_min_count": 4}, outputs=OUTPUTS_OF_CELLS),
     # Several tiles of RESTORE_TILE and of PROBE_TILE, those at the edges no whole ones.
     "tiles": Job(room, "psf", {"cell_walls": False}, size=(37, 23)),

@@ -129,6 +129,9 @@
 #ifndef RESTORE
 #error "RESTORE must be 0 or 1 (what averages per cell take from a pixel is kept apart)"
 #endif
+#ifndef FIREFLIES
+#error "FIREFLIES must be 0 or 1 (pixels that few samples speak for are dimmed)"
+#endif
 #ifndef METROPOLIS
 #error "METROPOLIS must be 0 or 1 (paths are those of chains)"
 #endif

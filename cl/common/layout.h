@@ -821,10 +821,10 @@ typedef struct {
     float count; // samples that it is worth
     float base[3]; // of that, what the diffuse base of the first surface reflected
     float alpha; // weight that this frame has in it
-    float square; // mean of the squared luminance of frames
+    float square; // mean of the squared luminance of frames, or of the samples of one
     float change; // of the light since the frame before, 0 to 1
     float noise; // variance of the luminance of `base`, NOISE_UNKNOWN where nothing can be told
-    float pad; // fills the record
+    float means; // how many, samples or frames, `square` is of
 } PixelLight;
 
 /// A pixel of the frame before: its light and what it sees.

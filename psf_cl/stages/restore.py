@@ -64,6 +64,7 @@ def plan(context: Context) -> StageSpec | None:
         "restore",
         "what averages lost is added back before the picture is handed out",
         "restore.cl",
+        flags=("FIREFLIES",),
         kernels=(
             KernelSpec("take_lost", lanes=False),
             KernelSpec("sum_tiles", lanes=False),
