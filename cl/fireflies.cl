@@ -105,5 +105,6 @@ kernel void hold_light(__global const Params *params, __global const float *kept
         light[pixel].rgb[c] *= part;
         light[pixel].base[c] *= part;
     }
-    light[pixel].noise *= part * part;
+    if (light[pixel].noise < NOISE_UNKNOWN)
+        light[pixel].noise *= part * part;
 }

@@ -59,20 +59,110 @@ static inline Surroundings seen_at(__global const SeenMean *surfaces, UInt pixel
     return s;
 }
 
-/// Average what the bases reflect of the light that falls on them.  One work item W pixels.
+/// Whether pixels at `here` and at `there` see one surface: normals agree, and each lies within a pixel's footprint
+/// of the plane of the other.
+static inline Mask one_surface(Surroundings here, Surroundings there, Vec3 between, Float footprint)
+{
+    return here.there & there.there & (dot3(here.ns, there.ns) > SAME_SURFACE_COSINE)
+           & (fabs(dot3(here.ns, between)) < footprint) & (fabs(dot3(there.ns, between)) < footprint);
+}
+
+// Pixels of a surface, of nine, that tell what noise is.
+#define FEWEST_PIXELS 4.0f
+
+// So many times the variance that they scatter by: they share cells, and so part of their noise.  One is sharper and
+// leaves more noise in five scenes, four blurs the shadows of the sun.
+#define SHARED_NOISE 2.0f
+
+static inline Vec3 gate_at(__global const SeenMean *surfaces, UInt pixel)
+{
+    return vec3(GATHER(surfaces, pixel, gate[0]), GATHER(surfaces, pixel, gate[1]), GATHER(surfaces, pixel, gate[2]));
+}
+
+static inline Vec3 base_at(__global const PixelLight *light, UInt pixel)
+{
+    return vec3(GATHER(light, pixel, base[0]), GATHER(light, pixel, base[1]), GATHER(light, pixel, base[2]));
+}
+
+/// Find the light that falls on the base of what pixels see, and the variance that it has by noise.  One work item W
+/// pixels.
 ///
-/// A neighbour counts if both see one surface: normals agree, each lies within a pixel's footprint of the
-/// plane of the other, they are no farther apart than the filter is wide on a surface that is seen at 60
-/// degrees, and the light that they get is alike but for noise: edges of shadows stay.  Neighbours are a fixed random set in a disk, stratified in radius and angle; the disk shrinks
-/// with the samples, count^(-1/4): its bias falls as fast as the noise.  Reflectances are weights, so that
-/// nothing is divided by what is next to none.
+/// Where samples do not tell the noise, for there is one, it is the mean of the pixel and of those around it that
+/// see the same surface, and they scatter by its noise.  Without that all light would be alike there: that of the
+/// sun would be blurred over its shadows.
 ///
 /// reads   light, surfaces_seen
+/// writes  arriving (light and variance)
+kernel void find_arriving(
+    __global const Params *params,
+    __global const PixelLight *light,
+    __global const SeenMean *surfaces_seen,
+    __global float *arriving)
+{
+    const uint first = get_global_id(0) * W;
+    if (first >= params->pixel_count)
+        return;
+    const UInt wanted = lanes_before(MASK_ALL) + first;
+    const UInt pixel = min(wanted, (UInt)(params->pixel_count - 1u));
+    const Float zero = (Float)(0.0f);
+    const Float gate = luminance(gate_at(surfaces_seen, pixel));
+    const Float noise = GATHER(light, pixel, noise);
+    const Mask known = noise < NOISE_UNKNOWN;
+    Float mean = luminance(base_at(light, pixel)) / max(gate, 1e-37f);
+    Float variance = pick(known, noise / max(gate * gate, 1e-37f), (Float)(NOISE_UNKNOWN));
+    if (any_lane(!known)) {
+        UInt x;
+        UInt y;
+        pixel_place(params, pixel, &x, &y);
+        x -= params->crop_x;
+        y -= params->crop_y;
+        const Surroundings here = seen_at(surfaces_seen, pixel);
+        const Float footprint = footprint_at(params, view_of(params), here.p);
+        Float count = zero;
+        Float sum = zero;
+        Float squares = zero;
+        for (uint k = 0; k < 9u; ++k) {
+            // To the left of the first pixel this wraps around, to beyond the last.
+            const UInt column = x + (k % 3u) - 1u;
+            const UInt row = y + (k / 3u) - 1u;
+            const Mask inside = (column < params->crop_width) & (row < params->crop_height);
+            const UInt other = pixel_entry(params, pick_u(inside, column, x), pick_u(inside, row, y));
+            const Surroundings there = seen_at(surfaces_seen, other);
+            const Float reflects = luminance(gate_at(surfaces_seen, other));
+            const Mask agrees = inside & (reflects > 0.0f)
+                                & one_surface(here, there, sub(there.p, here.p), footprint);
+            const Float arrives = pick(agrees, luminance(base_at(light, other)) / max(reflects, 1e-37f), zero);
+            count += pick(agrees, (Float)(1.0f), zero);
+            sum += arrives;
+            squares += arrives * arrives;
+        }
+        const Mask told = !known & (count >= FEWEST_PIXELS);
+        const Float n = max(count, FEWEST_PIXELS);
+        mean = pick(told, sum / n, mean);
+        variance = pick(told, SHARED_NOISE * NOISE_OF_MEAN(max(squares - sum * sum / n, zero), n), variance);
+    }
+    float lane[2][W];
+    store_lanes(mean, lane[0]);
+    store_lanes(variance, lane[1]);
+    const uint lanes = min(params->pixel_count - first, (uint)W);
+    for (uint k = 0; k < lanes; ++k)
+        vstore2((float2)(lane[0][k], lane[1][k]), first + k, arriving);
+}
+
+/// Average what the bases reflect of the light that falls on them.  One work item W pixels.
+///
+/// A neighbour counts if both see one surface, they are no farther apart than the filter is wide on a surface
+/// that is seen at 60 degrees, and the light that they get is alike but for noise: edges of shadows stay.  Neighbours
+/// are a fixed random set in a disk, stratified in radius and angle; the disk shrinks with the samples, count^(-1/4):
+/// its bias falls as fast as the noise.  Reflectances are weights, so that nothing is divided by what is next to none.
+///
+/// reads   light, surfaces_seen, arriving
 /// writes  filtered (RGB and a word)
 kernel void filter_screen(
     __global const Params *params,
     __global const PixelLight *light,
     __global const SeenMean *surfaces_seen,
+    __global const float *arriving,
     __global float *filtered)
 {
     const uint first = get_global_id(0) * W;
@@ -90,12 +180,10 @@ kernel void filter_screen(
     const Float reach = 2.0f * radius * footprint;
 
     const Vec3 rgb = vec3(GATHER(light, pixel, rgb[0]), GATHER(light, pixel, rgb[1]), GATHER(light, pixel, rgb[2]));
-    const Vec3 base = vec3(GATHER(light, pixel, base[0]), GATHER(light, pixel, base[1]), GATHER(light, pixel, base[2]));
-    const Vec3 gate = vec3(GATHER(surfaces_seen, pixel, gate[0]), GATHER(surfaces_seen, pixel, gate[1]),
-                           GATHER(surfaces_seen, pixel, gate[2]));
-    const Float own_light = luminance(base);
-    const Float own_gate = luminance(gate);
-    const Float own_noise = GATHER(light, pixel, noise);
+    const Vec3 base = base_at(light, pixel);
+    const Vec3 gate = gate_at(surfaces_seen, pixel);
+    const Float own_light = gather_words(arriving, 2u * pixel);
+    const Float own_noise = gather_words(arriving, 2u * pixel + 1u);
     Vec3 light_sum = scale(base, own);
     Vec3 gate_sum = scale(gate, own);
     Mask shared = !MASK_ALL;
@@ -119,19 +207,12 @@ kernel void filter_screen(
                                        to_uint(pick(inside, row, (Float)(0.0f))));
         const Surroundings there = seen_at(surfaces_seen, other);
         const Vec3 between = sub(there.p, here.p);
-        const Vec3 its_base = vec3(GATHER(light, other, base[0]), GATHER(light, other, base[1]),
-                                   GATHER(light, other, base[2]));
-        const Vec3 its_gate = vec3(GATHER(surfaces_seen, other, gate[0]), GATHER(surfaces_seen, other, gate[1]),
-                                   GATHER(surfaces_seen, other, gate[2]));
-        const Float its_light = luminance(its_base);
-        const Float reflects = luminance(its_gate);
-        const Float apart = own_light * reflects - its_light * own_gate;
-        const Float noise = own_noise * reflects * reflects + GATHER(light, other, noise) * own_gate * own_gate;
+        const Vec3 its_base = base_at(light, other);
+        const Vec3 its_gate = gate_at(surfaces_seen, other);
+        const Float apart = own_light - gather_words(arriving, 2u * other);
+        const Float noise = own_noise + gather_words(arriving, 2u * other + 1u);
         const Mask alike = !(apart * apart > ALIKE_VARIANCES * noise);
-        const Mask agrees = alike & inside & (other != pixel) & here.there & there.there
-                            & (dot3(here.ns, there.ns) > SAME_SURFACE_COSINE)
-                            & (fabs(dot3(here.ns, between)) < footprint)
-                            & (fabs(dot3(there.ns, between)) < footprint)
+        const Mask agrees = alike & inside & (other != pixel) & one_surface(here, there, between, footprint)
                             & (dot3(between, between) < reach * reach);
         const Float weight = pick(agrees, GATHER(light, other, count), (Float)(0.0f));
         light_sum = add_scaled(light_sum, its_base, weight);

@@ -1103,7 +1103,7 @@ class Renderer:
         self.weigh_launches = launches("weigh_film")
         self.picture_launches = [
             *self.blend_launches,
-            *launches("weigh_light", "hold_light", "filter_screen"),
+            *launches("weigh_light", "hold_light", "find_arriving", "filter_screen"),
         ]
 
     def _bind_cells(self, program: Program | None, history: Program | None) -> None:

@@ -31,8 +31,18 @@ def plan(context: Context) -> StageSpec | None:
         flags=("LENS",),
         kernels=(
             KernelSpec("resolve_light", lanes=False),
+            KernelSpec("find_arriving"),
             KernelSpec("filter_screen"),
         ),
-        buffers=(BufferSpec("filtered", np.dtype(np.float32), count, "filtered picture", True),),
+        buffers=(
+            BufferSpec(
+                "arriving",
+                np.dtype(np.float32),
+                2 * context.pixel_count,
+                "light that falls on what pixels see, and its variance",
+                True,
+            ),
+            BufferSpec("filtered", np.dtype(np.float32), count, "filtered picture", True),
+        ),
         per_pass=True,
     )
