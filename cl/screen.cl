@@ -16,6 +16,10 @@
 // and leave more noise: from 2 to 9 measured on three scenes.
 #define ALIKE_VARIANCES 3.0f
 
+// What others are less sure of by more than this counts as if it were not: else pixels that are sure of their shadow
+// take the light of those that see its edge.
+#define MORE_NOISE 4.0f
+
 /// Take the light of each pixel from the film.  One work item a pixel.
 ///
 /// reads   film, film_base
@@ -210,7 +214,8 @@ kernel void filter_screen(
         const Vec3 its_base = base_at(light, other);
         const Vec3 its_gate = gate_at(surfaces_seen, other);
         const Float apart = own_light - gather_words(arriving, 2u * other);
-        const Float noise = own_noise + gather_words(arriving, 2u * other + 1u);
+        const Float its_noise = gather_words(arriving, 2u * other + 1u);
+        const Float noise = own_noise + min(its_noise, MORE_NOISE * own_noise);
         const Mask alike = !(apart * apart > ALIKE_VARIANCES * noise);
         const Mask agrees = alike & inside & (other != pixel) & one_surface(here, there, between, footprint)
                             & (dot3(between, between) < reach * reach);

@@ -129,7 +129,7 @@ def model(opened, light, seen):
         agrees = inside & ((column != x) | (row != y)) & agree(at)
         agrees &= np.linalg.norm(p[at] - p, axis=-1) < 2 * radius * footprint
         apart = arrives_here - arrives_here[at]
-        agrees &= apart**2 <= 3 * (variance + variance[at])
+        agrees &= apart**2 <= 3 * (variance + np.minimum(variance[at], 4 * variance))
         for total, values in zip(sums, (light["base"], seen["gate"]), strict=True):
             total += np.where(agrees[..., None], weight[at] * values[at], 0.0)
         shared |= agrees
