@@ -9,6 +9,7 @@ import numpy as np
 from psf_cl.device import layout
 from psf_cl.features import restores
 from psf_cl.image import Image
+from psf_cl.launches import run
 from psf_cl.stages import cells, film, guide, photons
 
 if TYPE_CHECKING:
@@ -48,18 +49,7 @@ def image_of(renderer: Renderer, names: set[str]) -> Image:
     if "film_direct" in sums:
         aovs["direct"] = mean(sums["film_direct"][0])
     if not partial:
-        for launch, items in renderer.weigh_launches:
-            launch(items, film.GROUP)
-        if restores(renderer.settings).value:
-            aovs["rgb"] = _restored(renderer, counters)
-        elif renderer.picture_launches:
-            aovs["rgb"] = _picture(renderer)
-        if "kept" in renderer.buffers:
-            kept = _in_rows(renderer, renderer.device.read(renderer.buffers["kept"])[:, None])
-            if not (restores(renderer.settings).value or renderer.picture_launches):
-                aovs["rgb"] *= kept
-            if "direct" in aovs:
-                aovs["direct"] *= kept
+        aovs |= _finished(renderer, aovs, counters)
     if "direct" in aovs:
         aovs["indirect"] = aovs["rgb"] - aovs["direct"]
     if "film_features" in sums:
@@ -92,10 +82,26 @@ def image_of(renderer: Renderer, names: set[str]) -> Image:
     )
 
 
+def _finished(
+    renderer: Renderer, aovs: dict[str, np.ndarray], counters: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return what is done to the image, and to its direct light, before they are handed out."""
+    finished: dict[str, np.ndarray] = {}
+    run(renderer.pictures.weigh)
+    if restores(renderer.settings).value:
+        finished["rgb"] = _restored(renderer, counters)
+    elif renderer.pictures.blend:
+        finished["rgb"] = _picture(renderer)
+    if "kept" in renderer.buffers:
+        kept = _in_rows(renderer, renderer.device.read(renderer.buffers["kept"])[:, None])
+        dimmed = {"rgb", "direct"} & aovs.keys() - finished.keys()
+        finished |= {name: aovs[name] * kept for name in dimmed}
+    return finished
+
+
 def _picture(renderer: Renderer) -> np.ndarray:
-    """Return the image with what is done to it before it is handed out, ``(h, w, 3)``."""
-    for launch, items in renderer.picture_launches:
-        launch(items, film.GROUP)
+    """Return the image of the light of pixels, with the frames before, ``(h, w, 3)``."""
+    run([*renderer.pictures.blend, *renderer.pictures.finish])
     if "filtered" in renderer.buffers:
         pixels = renderer.device.read(renderer.buffers["filtered"]).reshape(-1, 4)[:, :3]
     else:
@@ -119,8 +125,7 @@ def _temporal_aovs(renderer: Renderer, count: np.ndarray, partial: bool) -> dict
         names = {"history": "count", "alpha": "alpha", "gradient": "change"}
         aovs = {name: light[field] for name, field in names.items()}
     if "motion" in renderer.buffers:
-        for launch, items in renderer.motion_launches:
-            launch(items, film.GROUP)
+        run(renderer.pictures.motion)
         aovs["motion"] = renderer.device.read(renderer.buffers["motion"])
     return {
         name: _in_rows(renderer, values.reshape(renderer.plan.pixel_count, -1))

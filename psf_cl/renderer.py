@@ -34,6 +34,7 @@ from psf_cl.features import whole_kinds
 from psf_cl.few import NO_PLATES, Few, Plates, list_of
 from psf_cl.image import Image
 from psf_cl.instancing import Placed, place
+from psf_cl.launches import CellLaunches, bind_cells, bind_pictures, run
 from psf_cl.measure.errors import error_of_halves
 from psf_cl.mover import Mover
 from psf_cl.pictures import image_of
@@ -55,7 +56,6 @@ from psf_cl.stages import (
     material_cells,
     metropolis,
     photons,
-    probes,
     range_search,
     restore,
     screen,
@@ -214,8 +214,8 @@ class Renderer:
     def _film(self) -> None:
         if self.range_search is not None:
             self.range_search.filter_passes(self.device.read(self.buffers["counters"]))
-        for launch, items in self.cell_launches:
-            launch(items, film.GROUP)
+        if self.cells is not None:
+            run(self.cells.share)
         for launch in self.splat_launches:
             launch(self.film_items(1), film.GROUP)
         for launch, planes in self.film_launches:
@@ -224,8 +224,8 @@ class Renderer:
             self.half(self.film_items(1), film.GROUP)
         if self.add_seen is not None:
             self.add_seen(self.film_items(1), film.GROUP)
-        if self.clear_cells is not None:
-            self.clear_cells(self.plan.cell_buckets)
+        if self.cells is not None:
+            self.cells.clear(self.plan.cell_buckets)
         self.advance(1)
 
     def film_items(self, planes: int) -> int:
@@ -323,13 +323,12 @@ class Renderer:
 
     def _keep_history(self) -> None:
         """Keep the picture of the frame that ends for the next one, if that asks for it."""
-        if self.history_launches:
+        if self.pictures.keep:
             # Not what the screen filter makes of it: light would spread from frame to frame.
-            for launch, items in (*self.blend_launches, *self.history_launches):
-                launch(items, film.GROUP)
-            if self.keep_cells is not None:
-                self.keep_cells(self.plan.cell_buckets, film.GROUP)
-            for launch, items in self.probe_launches:
+            run([*self.pictures.blend, *self.pictures.keep])
+            if self.cells is not None and self.cells.keep is not None:
+                self.cells.keep(self.plan.cell_buckets, film.GROUP)
+            for launch, items in self.pictures.place:
                 launch(items)
 
     def _find_changes(self) -> None:
@@ -337,7 +336,7 @@ class Renderer:
         if self.changed:
             if "cell_changes" in self.buffers:
                 self.device.fill(self.buffers["cell_changes"])
-            for launch, items in self.change_launches:
+            for launch, items in self.pictures.compare:
                 launch(items)
         elif "changes" in self.buffers:
             self.device.fill(self.buffers["changes"])
@@ -1011,7 +1010,13 @@ class Renderer:
             if not (stage.per_pass or stage.per_frame)
             for kernel in stage.kernels
         ]
-        self._bind_cells(programs.get("cells"), programs.get("cell_history"))
+        self.cells: CellLaunches | None = None
+        self.add_unfiltered: Launch | None = None
+        if "cells" in programs:
+            self.cells = bind_cells(
+                self.plan, programs["cells"], programs.get("cell_history"), self.buffers
+            )
+            self.add_unfiltered = programs["cells"].bind_planned("add_unfiltered", self.buffers)
         self._bind_range_search(programs.get("range_search"))
         self._bind_chains(programs.get("splats"))
         if "guide" in programs:
@@ -1058,7 +1063,7 @@ class Renderer:
         self.add_seen = (
             programs["seen"].bind_planned("add_seen", self.buffers) if "seen" in programs else None
         )
-        self._bind_pictures(programs)
+        self.pictures = bind_pictures(self.plan, programs, self.buffers)
         self.restore: restore.Restore | None = None
         if "restore" in programs:
             size = self.plan.crop[2:]
@@ -1072,66 +1077,6 @@ class Renderer:
                 census=self.buffers["census"],
                 bins=film.CENSUS_BINS,
             )
-
-    def _bind_pictures(self, programs: dict[str, Program]) -> None:
-        """Bind what makes the picture of sums and history, and the history of the picture."""
-
-        def launches(*names: str, count: int = self.plan.pixel_count) -> list[tuple[Launch, int]]:
-            return [
-                (
-                    programs[stage.name].bind_planned(name, self.buffers),
-                    -(-count // kernel.paths_per_item(self.plan.traits)),
-                )
-                for name in names
-                for stage in self.plan.stages
-                for kernel in stage.kernels
-                if kernel.name == name
-            ]
-
-        shared = bool(self.plan.features["TEMPORAL"].value)
-        self.motion_launches = launches("find_motion")
-        self.history_launches = launches("keep_history")
-        count = probes.count(*self.plan.crop[2:])
-        # Before the scene moves, and after it.
-        self.probe_launches = launches("place_probes", "measure_probes", count=count)
-        self.change_launches = launches(
-            "measure_probes", "pool_probes", "spread_changes", count=count
-        )
-        self.blend_launches = (
-            launches("find_motion", "blend_history") if shared else launches("resolve_light")
-        )
-        self.weigh_launches = launches("weigh_film")
-        self.picture_launches = [
-            *self.blend_launches,
-            *launches("weigh_light", "hold_light", "find_arriving", "filter_screen"),
-        ]
-
-    def _bind_cells(self, program: Program | None, history: Program | None) -> None:
-        self.cell_launches: list[tuple[Launch, int]] = []
-        self.add_unfiltered = self.clear_cells = self.keep_cells = None
-        if program is None:
-            return
-        traits, pixels = self.plan.traits, self.plan.pixel_count
-        per_pixel = -(-pixels // (traits.lanes * traits.run))
-        per_bucket = self.plan.cell_buckets
-        stage = next(stage for stage in self.plan.stages if stage.name == "cells")
-        order = (
-            (program, "count_crowds", per_pixel),
-            (program, "mark_near_cells", per_pixel),
-            (program, "store_cells", per_pixel),
-            (history, "gather_cells", per_bucket),
-            (program, "resolve_cells", per_bucket),
-            (program, "look_up_cells", per_pixel),
-        )
-        self.cell_launches = [
-            (where.bind_planned(name, self.buffers), items)
-            for where, name, items in order
-            if where is not None and (where is history or name in stage.kernel_names)
-        ]
-        if history is not None:
-            self.keep_cells = history.bind_planned("keep_cells", self.buffers)
-        self.clear_cells = program.bind_planned("clear_cells", self.buffers)
-        self.add_unfiltered = program.bind_planned("add_unfiltered", self.buffers)
 
     def _bind_range_search(self, program: Program | None) -> None:
         if self.range_search is not None:

@@ -139,7 +139,7 @@ def _path_statistics(
 
 
 def _cell_statistics(renderer: Renderer, counters: np.ndarray) -> dict[str, int | float] | None:
-    if renderer.clear_cells is None:
+    if renderer.cells is None:
         return None
 
     names = ("failed_inserts", "rejected_cells", "unfiltered_samples")

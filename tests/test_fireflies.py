@@ -11,6 +11,7 @@ from test_cells import FILTER, room
 
 from psf_cl.device.device import open_device
 from psf_cl.errors import InputError
+from psf_cl.launches import run
 from psf_cl.plan import make_plan
 from psf_cl.settings import Settings, preset_values
 
@@ -184,8 +185,7 @@ def test_light_of_frames_is_dimmed_before_it_is_filtered(device, ways):
     """As the model does, by what pixels have before."""
     opened = renderer(device, room(SIZE), **ways, **DIM, **NOISY)
     opened.render(spp=4)
-    for launch, items in opened.blend_launches:
-        launch(items, 64)
+    run(opened.pictures.blend)
     light = opened.device.read(opened.buffers["light"])
     mean = rows(opened, light["rgb"].astype(np.float64) @ LUMINANCE)
     square = rows(opened, light["square"].astype(np.float64))

@@ -212,9 +212,9 @@ def cell_averages(opened, number, values):
             device.write(buffers["counters"], np.array([value], np.uint32), at)
 
     set_counters(number, count)
-    for launch, items in opened.cell_launches:
+    for launch, items in opened.cells.share:
         launch(items)
-    opened.clear_cells(cells.buckets(count))
+    opened.cells.clear(cells.buckets(count))
     found = device.read(buffers["samples"]).reshape(-1, 4)[own, :3].astype(np.float64)
     set_counters(number + 1, 0)
     return found / np.maximum(gate, 1e-9)

@@ -10,6 +10,7 @@ from scene_builder import LUMINANCE, build, camera, floor, glowing, lambertian, 
 
 from psf_cl.device import layout
 from psf_cl.device.device import open_device
+from psf_cl.launches import run
 from psf_cl.plan import make_plan
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.model import Environment, Material, Texture
@@ -143,10 +144,8 @@ def filtered(opened, light, seen):
     device, order = opened.device, opened.order
     device.write(opened.buffers["light"], light.reshape(-1)[order])
     device.write(opened.buffers["surfaces_seen"], seen.reshape(-1)[order])
-    launches = opened.picture_launches[-2:]
-    assert [launch.name for launch, _ in launches] == ["find_arriving", "filter_screen"]
-    for launch, items in launches:
-        launch(items)
+    assert len(opened.pictures.finish) == 2
+    run(opened.pictures.finish)
     picture = np.zeros((light.size, 4), np.float32)
     picture[order] = device.read(opened.buffers["filtered"]).reshape(-1, 4)
     return picture[:, :3].reshape(*light.shape, 3)

@@ -24,7 +24,7 @@ ROWS = [
     {"device"},
     {"stages", "few", "tables", "whole_lights", "instancing", "motion", "mover"},
     {"features"},
-    {"chains", "plan", "scheduler", "soundness", "checkpoint", "learned"},
+    {"chains", "launches", "plan", "scheduler", "soundness", "checkpoint", "learned"},
     {"renderer", "pictures", "stats"},
     {"cli"},
     {"__init__", "__main__"},

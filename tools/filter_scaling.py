@@ -95,9 +95,9 @@ def filter_by_cells(side: int, rounds: int) -> float:
     renderer = with_a_pass(side, "hash_grid")
 
     def work() -> None:
-        for launch, items in renderer.cell_launches:
+        for launch, items in renderer.cells.share:
             launch(items)
-        renderer.clear_cells(renderer.plan.pixel_count)
+        renderer.cells.clear(renderer.plan.pixel_count)
 
     seconds = [seconds_of(renderer, work) for _ in range(rounds)]
     renderer.close()
