@@ -105,7 +105,6 @@ def test_references_of_frames_are_made_and_rules_compared(device, tmp_path, caps
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (["--seconds", "1"], "--frames: expected one --spp"),
         (["--spp", "1,2"], "--frames: expected one --spp"),
         (["--command", "a: b {out} {seconds}"], "--command: not with --frames"),
     ],
@@ -114,6 +113,23 @@ def test_what_does_not_go_with_frames_is_refused(tmp_path, capsys, more, message
     arguments = ["--reference", "ref.exr", "--frames", "0:2", "-o", str(tmp_path), *more]
     assert main(["converge", LIGHT_OFF, *arguments]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_frames_get_as_many_seconds_each(device, tmp_path, capsys):
+    """On average: a pass that takes longer takes from the next frames."""
+    scene = (LIGHT_OFF, "--size", "24x18", "--frames", "0:8")
+    make_references([*scene, "--spp", "8", "--seeds", "2", "-o", str(tmp_path / "####.exr")])
+    out = tmp_path / "report"
+    runs = ("--run", "alone: preset=pt", "--run", "screen: screen_filter=path_space")
+    where = ("--reference", str(tmp_path), "-o", str(out), *runs, "--seeds", "2")
+    assert main(["converge", *scene, *where, "--seconds", "0.2"]) == 0
+    assert "; a frame: " in capsys.readouterr().out
+    with (out / "sequences.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for row in rows:
+        assert float(row["spp_per_frame"]) >= 1.0
+        assert float(row["seconds_per_frame"]) >= 0.2
+    assert "frames 0 to 7 of 0.2 s" in (out / "report.html").read_text()
 
 
 def test_references_need_a_run_of_marks_and_to_be_there(tmp_path, capsys):

@@ -100,10 +100,15 @@ def add_parser(commands: Any) -> None:
         "--seconds",
         metavar="S",
         type=positive_number,
-        help=f"look at the first pass and at 1, 2, 4, ... S seconds (default {DEFAULT_SECONDS:g})",
+        help=f"look at the first pass and at 1, 2, 4, ... S seconds (default {DEFAULT_SECONDS:g}); "
+        "with --frames: of each frame, with all that is done between frames and to the picture",
     )
     budget.add_argument(
-        "--spp", metavar="A,B,...", type=_counts, help="look at these samples a pixel instead"
+        "--spp",
+        metavar="A,B,...",
+        type=_counts,
+        help="look at these samples a pixel instead; with "
+        "--frames: one number, that of each frame (default 1)",
     )
     parser.add_argument(
         "--seeds",

@@ -6,6 +6,7 @@ import argparse
 import csv
 import io
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from html import escape
@@ -35,6 +36,8 @@ class Result:
         errors: relMSE of each frame.
         fresh: the same of a start in the frame of the change.
         lag: see ``sequences.lag``.
+        spp, seconds: of a frame, on average: samples a pixel, and wall time with all that is done
+            between frames and to the picture.
     """
 
     name: str
@@ -42,6 +45,19 @@ class Result:
     fresh: np.ndarray
     lag: int | None
     flicker: float
+    spp: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What each frame gets: samples a pixel, or seconds on average (a pass at least)."""
+
+    spp: int | None
+    seconds: float | None
+
+    def __str__(self) -> str:
+        return f"{self.seconds:g} s" if self.spp is None else f"{self.spp} samples"
 
 
 def read_truth(pattern: str, frames: range) -> tuple[sequences.Truth, tuple[int, int], list[int]]:
@@ -72,18 +88,31 @@ def read_truth(pattern: str, frames: range) -> tuple[sequences.Truth, tuple[int,
 
 
 def render_frames(
-    scene: Scene, settings: Settings, device: Device, frames: range, fps: float, spp: int
-) -> list[np.ndarray]:
-    """Return the pictures of the frames, each ``(h, w, 3)``; the first knows of none before."""
+    scene: Scene, settings: Settings, device: Device, frames: range, fps: float, budget: Budget
+) -> tuple[list[np.ndarray], float, float]:
+    """Return the pictures of the frames, each ``(h, w, 3)``; the first knows of none before.
+
+    Returns:
+        The pictures, and samples and seconds of a frame on average.
+    """
     renderer = Renderer(scene, settings, device, time=frames.start / fps)
     try:
-        pictures = []
+        pictures, passes, spent = [], 0, 0.0
         for frame in frames:
+            start = time.perf_counter()
             if frame != frames.start:
                 renderer.set_frame(frame / fps)
-            renderer.render(spp=spp)
+            if budget.seconds is None:
+                renderer.render(spp=budget.spp)
+            else:
+                # A frame that took longer leaves less for the next.
+                due = (len(pictures) + 1) * budget.seconds - spent
+                left = max(due - (time.perf_counter() - start), 1e-9)
+                renderer.render(seconds=renderer.scheduler.clock.now() + left)
             pictures.append(renderer.snapshot().rgb)
-        return pictures
+            passes += renderer.scheduler.passes
+            spent += time.perf_counter() - start
+        return pictures, passes / len(pictures), spent / len(pictures)
     finally:
         renderer.close()
 
@@ -99,9 +128,10 @@ def run(args: argparse.Namespace, contestants: Sequence[Contestant], folder: Pat
     if any(one.settings is None for one in contestants):
         raise InputError("--command: not with --frames")
     frames: range = args.frames
-    spp = args.spp[0].spp if args.spp else 1
-    if args.seconds or (args.spp and len(args.spp) > 1):
+    if args.spp and len(args.spp) > 1:
         raise InputError("--frames: expected one --spp, that of each frame (default 1)")
+    spp = args.spp[0].spp if args.spp else 1
+    budget = Budget(None if args.seconds else spp, args.seconds)
     truth, size, taken = read_truth(args.reference, frames)
     change = frames.start + truth.largest_change() if args.change is None else args.change
     if change not in frames:
@@ -128,22 +158,24 @@ def run(args: argparse.Namespace, contestants: Sequence[Contestant], folder: Pat
     device = open_prepared_device(args.device, False)
     results = []
     for one in contestants:
-        errors, fresh, flickers = [], [], []
+        errors, fresh, flickers, spent = [], [], [], []
         for seed in seeds:
             own = replace(one.settings, seed=seed)
-            pictures = render_frames(scene, own, device, frames, args.fps, spp)
+            pictures, *cost = render_frames(scene, own, device, frames, args.fps, budget)
+            spent.append(cost)
             errors.append(sequences.frame_errors(pictures, truth))
             flickers.append(sequences.flicker(pictures, truth))
             since = range(change, frames.stop)
-            pictures = render_frames(scene, own, device, since, args.fps, spp)
+            pictures, *_ = render_frames(scene, own, device, since, args.fps, budget)
             fresh.append(sequences.frame_errors(pictures, truth, change - frames.start))
         mean, start = np.mean(errors, axis=0), np.mean(fresh, axis=0)
         late = sequences.lag(mean[change - frames.start :], start)
-        results.append(Result(one.name, mean, start, late, float(np.mean(flickers))))
+        flicker, cost = float(np.mean(flickers)), np.mean(spent, axis=0)
+        results.append(Result(one.name, mean, start, late, flicker, *cost.tolist()))
         if not args.quiet:
             print(_line(results[-1]), flush=True)
     lead = (
-        f"{size[0]}x{size[1]} pixels, frames {frames.start} to {frames.stop - 1} of {spp} samples, "
+        f"{size[0]}x{size[1]} pixels, frames {frames.start} to {frames.stop - 1} of {budget}, "
         f"means of {len(seeds)} runs; a fresh start begins in frame {change}."
     )
     files = {
@@ -162,7 +194,7 @@ def _line(result: Result) -> str:
     late = "never" if result.lag is None else f"in frame {result.lag}"
     return (
         f"{result.name}: relMSE summed {result.errors.sum():.4g}, caught up {late} since the "
-        f"change, flicker {result.flicker:.3g}"
+        f"change, flicker {result.flicker:.3g}; a frame: {result.spp:.3g} spp, {result.seconds:.3g} s"
     )
 
 
@@ -179,13 +211,15 @@ def frames_csv(results: Sequence[Result], frames: range, change: int) -> str:
 
 
 def sequences_csv(results: Sequence[Result]) -> str:
-    """Return a line for each contestant: summed error, lag (empty for never), and flicker."""
+    """Return a line for each contestant: summed error, lag (empty for never), flicker, and cost."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["contestant", "relmse_sum", "lag", "flicker"])
+    names = ["contestant", "relmse_sum", "lag", "flicker", "spp_per_frame", "seconds_per_frame"]
+    writer.writerow(names)
     for one in results:
         late = "" if one.lag is None else one.lag
-        writer.writerow([one.name, repr(float(one.errors.sum())), late, repr(one.flicker)])
+        values = [float(one.errors.sum()), late, one.flicker, one.spp, one.seconds]
+        writer.writerow([one.name, *(v if isinstance(v, (int, str)) else repr(v) for v in values)])
     return text.getvalue()
 
 
@@ -209,7 +243,8 @@ def page(title: str, lead: str, results: Sequence[Result], frames: range) -> str
     figure = plot.figure([plot.panel("relMSE", "frames rendered", curves)], names)
     rows = "".join(
         f"<tr><td>{escape(one.name)}</td><td>{one.errors.sum():.4g}</td>"
-        f"<td>{'never' if one.lag is None else one.lag}</td><td>{one.flicker:.3g}</td></tr>"
+        f"<td>{'never' if one.lag is None else one.lag}</td><td>{one.flicker:.3g}</td>"
+        f"<td>{one.spp:.3g}</td><td>{one.seconds:.3g}</td></tr>"
         for one in results
     )
     style = (Path(plot.__file__).parent / "report.css").read_text(encoding="utf-8")
@@ -218,6 +253,7 @@ def page(title: str, lead: str, results: Sequence[Result], frames: range) -> str
         f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{escape(title)}</title>'
         f"<style>{style}</style><h1>{escape(title)}</h1><p>{escape(lead)}</p>{figure.svg()}"
         "<table><tr><th></th><th>relMSE, summed</th><th>caught up in frame since the change</th>"
-        f"<th>flicker</th></tr>{rows}</table><p>Flicker: variance from frame to frame where the "
+        "<th>flicker</th><th>samples a frame</th><th>s a frame</th></tr>"
+        f"{rows}</table><p>Flicker: variance from frame to frame where the "
         f"references rest.</p><p>psf_cl {psf_cl.__version__}: psf-cl {command}</p></html>\n"
     )
