@@ -34,8 +34,7 @@ kernel void add_seen(
         for (uint k = 0; k < passes; ++k) {
             const ulong pass = (counters[COUNTER_FILM_PASS] + k) & (params->ring - 1u);
             __global const Seen *one = seen + pass * params->pixel_count + pixel;
-            if (mean->count == 0u)
-                mean->shape = one->shape;
+            mean->shape = (mean->count == 0u ? one->shape : mean->shape) | (one->shape & SHAPE_SHINES);
             mean->count += 1u;
             add_to_mean(mean->gate, one->gate, 1.0f / (float)mean->count);
             if (!one->shape)

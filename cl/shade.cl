@@ -469,13 +469,14 @@ kernel void shade_paths(
     const Mask delta = is_delta(b);
 #if SEEN
 #if INSTANCES
-    const UInt shape = 1u + ((s.instance * 0x9e3779b1u + GATHER_U(surfaces, s.triangle, shape)) >> 2);
+    UInt shape = 1u + ((s.instance * 0x9e3779b1u + GATHER_U(surfaces, s.triangle, shape)) >> 3);
 #elif MOTION
-    const UInt shape = (1u + GATHER_U(surfaces, triangle, shape))
+    UInt shape = (1u + GATHER_U(surfaces, triangle, shape))
                        | pick_u(triangle >= params->first_moving, (UInt)(SHAPE_MOVES), (UInt)(0u));
 #else
-    const UInt shape = 1u + GATHER_U(surfaces, triangle, shape);
+    UInt shape = 1u + GATHER_U(surfaces, triangle, shape);
 #endif
+    shape |= pick_u(luminance(emitted) > 0.0f, (UInt)(SHAPE_SHINES), (UInt)(0u));
 #if SEEN == 2 && MOTION
     const Vec3 before = previous_point(params, previous, triangle, u, v, s.p);
 #else

@@ -100,7 +100,8 @@ static inline void add_history(
                                                  GATHER(history, at, p[2])));
     const Mask same_plane = (fabs(dot3(ns, between)) < wanted.footprint)
                             & (fabs(dot3(wanted.ns, between)) < wanted.footprint);
-    const Mask same = (shape == wanted.shape)
+    // What glows itself would be smeared over all that its pixels' edges come by.
+    const Mask same = (shape == wanted.shape) & ((shape & SHAPE_SHINES) == 0u)
                       & ((shape == 0u) | (same_plane & (dot3(ns, wanted.ns) > SAME_SURFACE_COSINE)));
     // Where neither moves, the edges that a pixel sees are those that it saw.
     const Mask rests = unmoved & (still | (((shape | wanted.shape) & SHAPE_MOVES) == 0u));
@@ -170,7 +171,7 @@ static inline Shared shared_by_cells(
 /// Blend the light of this frame with what is known from the frames before.  One work item W pixels.
 ///
 /// A pixel looks where its surface was, between four pixels, and takes those that saw the same: the same
-/// shape, normals that agree, each within a pixel's footprint of the plane of the other.  One that moved by
+/// shape, nothing of it glowing, normals that agree, each within a pixel's footprint of the plane of the other.  One that moved by
 /// whole pixels, or not at all, takes one of them as it is.
 ///
 /// reads   film, film_base, surfaces_seen, motion, history, changes; shared_light, shared_history

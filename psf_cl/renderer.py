@@ -262,9 +262,11 @@ class Renderer:
             self.chains.start() if is_first else self.chains.measure()
         if self.photon_map is not None:
             if start == self.scheduler.first:
-                self.photon_map.clear()
+                self.photon_map.begin_frame(self.changed or start == 0)
             paths = len(self._epoch(start)) * self.plan.pixel_count
-            count = photons.photons_for(self.settings, paths, self.scheduler.rays)
+            count = photons.photons_for(
+                self.settings, paths, self.scheduler.rays, self.photon_map.fewest
+            )
             self.photon_map.add(count, self.scheduler.first)
 
     def _epoch_end(self, passes: int) -> int:

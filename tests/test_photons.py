@@ -16,11 +16,12 @@ from psf_cl.device import layout
 from psf_cl.errors import InputError
 from psf_cl.features import MANY_LIGHTS
 from psf_cl.plan import make_plan
+from psf_cl.renderer import Renderer
 from psf_cl.scene import primitives, transform
 from psf_cl.scene.load import load_scene
 from psf_cl.scene.model import Light, Mesh
 from psf_cl.settings import AOVS, Settings
-from psf_cl.stages.photons import FEWEST, MOST, VIEWS, photons_for
+from psf_cl.stages.photons import FEWEST, FEWEST_MORE, MOST, VIEWS, photons_for
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 PLACES = layout.CONSTANT["PARTICLE_PLACES"]
@@ -82,6 +83,23 @@ def test_every_photon_is_accounted_for(opened):
 )
 def test_photons_are_as_many_as_was_said_or_a_share_of_the_rays(settings, paths, rays, photons):
     assert photons_for(Settings(**settings), paths, rays) == photons
+
+
+@pytest.mark.parametrize("name", ["many_lights", "moving/light_off"])
+def test_photons_stay_from_frame_to_frame_where_nothing_moves_but_the_camera(device, name):
+    scene = load_scene(SCENES / f"{name}.toml", moving=True, size=(12, 9))
+    opened = Renderer(scene, Settings(light_sampling="photon"), device)
+    drawn = []
+    for frame in range(3):
+        if frame:
+            opened.set_frame(frame / 24)
+        opened.render(spp=1)
+        drawn.append(opened.photon_map.drawn())
+    opened.close()
+    if name == "many_lights":
+        assert drawn == [FEWEST, FEWEST + FEWEST_MORE, FEWEST + 2 * FEWEST_MORE]
+    else:
+        assert drawn == [FEWEST] * 3
 
 
 def test_photons_are_shared_out_by_the_power_of_the_lamps(opened):

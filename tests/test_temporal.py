@@ -340,6 +340,23 @@ def test_history_goes_along_with_what_moves(device, tmp_path):
     np.testing.assert_allclose(images[3].aovs["history"][..., 0], history, atol=1e-3)
 
 
+def test_a_lamp_in_view_is_not_smeared_over_what_is_around_it(device):
+    """Edges of its pixels are those of a floor, with its light in them: none of it goes on."""
+    above = transform.translation((0.013, 0.001, 0.0)) @ transform.scaling(0.1)
+    parts = [
+        floor(3.0, lambertian(0.5)),
+        (primitives.quad(), above, glowing(50.0)),
+    ]
+    views = [camera((0.021 * k, 2.0, 0.0), (0.021 * k, 0, 0), 40, up=(0, 0, -1)) for k in range(8)]
+    scene = build(parts, views[0], (32, 24))
+    ways = {"max_depth": 0, "views": views, "outputs": ()}
+    seen = sequence(device, scene, 8, spp=64, **ways)[-1].rgb[..., 0]
+    image = sequence(device, scene, 8, spp=4, **ways, temporal="cumulative")[-1].rgb[..., 0]
+    assert seen.max() == pytest.approx(50.0, rel=1e-4)
+    np.testing.assert_array_equal(image[seen == 0.0], 0.0)
+    assert image.mean() == pytest.approx(seen.mean(), rel=0.1)
+
+
 MOVING = Path(__file__).parents[1] / "scenes" / "moving"
 
 

@@ -73,6 +73,7 @@
 #define CELL_NEAR 4u // samples of light from near have cells of their own
 #define CELL_IDENTITY 2u // every sample has a cell of its own: nothing is shared (tests)
 #define SHAPE_MOVES 0x80000000u // its triangles move between frames
+#define SHAPE_SHINES 0x40000000u // it glows where it is seen
 #define RULE_OFF 0u // frames know nothing of one another
 #define RULE_EXPONENTIAL 1u // a frame has a constant weight
 #define RULE_CUMULATIVE 2u // all samples since it was first seen have the same weight
@@ -796,7 +797,7 @@ typedef struct {
 /// The first surface that a sample sees.
 typedef struct {
     float p[3]; // world, m
-    uint shape; // 1 + its number, SHAPE_MOVES; 0 if nothing is seen
+    uint shape; // 1 + its number, SHAPE_MOVES, SHAPE_SHINES; 0 if nothing is seen
     float ns[3]; // unit, shading normal
     float gate[3]; // throughput there, times the reflectance of the diffuse base
     float share[3]; // part of what comes from beyond it, or its cell, that its base reflects
@@ -810,7 +811,7 @@ typedef struct {
     float ns[3]; // of the shading normals
     uint count; // samples
     float gate[3]; // of all samples: 0 where one sees nothing
-    uint shape; // of the first sample
+    uint shape; // of the first sample; SHAPE_SHINES of any
     float before[3]; // where it was in the frame before
     float pad; // fills the record
 } SeenMean;

@@ -194,7 +194,8 @@ def _line(result: Result) -> str:
     late = "never" if result.lag is None else f"in frame {result.lag}"
     return (
         f"{result.name}: relMSE summed {result.errors.sum():.4g}, caught up {late} since the "
-        f"change, flicker {result.flicker:.3g}; a frame: {result.spp:.3g} spp, {result.seconds:.3g} s"
+        f"change, flicker {result.flicker:.3g}; a frame: {result.spp:.3g} spp, "
+        f"{result.seconds:.3g} s"
     )
 
 

@@ -489,7 +489,7 @@ SEEN = Record(
     "The first surface that a sample sees.",
     _fields("""
     float p[3] - world, m
-    uint shape - 1 + its number, SHAPE_MOVES; 0 if nothing is seen
+    uint shape - 1 + its number, SHAPE_MOVES, SHAPE_SHINES; 0 if nothing is seen
     float ns[3] - unit, shading normal
     float gate[3] - throughput there, times the reflectance of the diffuse base
     float share[3] - part of what comes from beyond it, or its cell, that its base reflects
@@ -506,7 +506,7 @@ SEEN_MEAN = Record(
     float ns[3] - of the shading normals
     uint count - samples
     float gate[3] - of all samples: 0 where one sees nothing
-    uint shape - of the first sample
+    uint shape - of the first sample; SHAPE_SHINES of any
     float before[3] - where it was in the frame before
     float pad - fills the record
     """),
@@ -1131,6 +1131,7 @@ CONSTANTS = (
     ("CELL_NEAR", 4, "samples of light from near have cells of their own"),
     ("CELL_IDENTITY", 2, "every sample has a cell of its own: nothing is shared (tests)"),
     ("SHAPE_MOVES", 0x80000000, "its triangles move between frames"),
+    ("SHAPE_SHINES", 0x40000000, "it glows where it is seen"),
     ("RULE_OFF", 0, "frames know nothing of one another"),
     ("RULE_EXPONENTIAL", 1, "a frame has a constant weight"),
     ("RULE_CUMULATIVE", 2, "all samples since it was first seen have the same weight"),

@@ -29,6 +29,10 @@ _FRAME_STEP = 0x9E3779B1
 FEWEST, MOST = 1 << 14, 1 << 20
 RAYS_EXPECTED = 10
 
+#: At least, where photons of the frames before are there; and how many of these there may be: what
+#: the camera has left behind goes then.
+FEWEST_MORE, MOST_KEPT = 1 << 10, 1 << 24
+
 #: Cells of the map, a power of two.
 CELLS = 1 << 15
 
@@ -45,7 +49,9 @@ RECORD_WORDS = 4
 KIND_WORDS = 2
 
 
-def photons_for(settings: Settings, paths: int, rays: Mapping[str, int]) -> int:
+def photons_for(
+    settings: Settings, paths: int, rays: Mapping[str, int], fewest: int = FEWEST
+) -> int:
     """Return the photons to emit before an epoch of so many ``paths``.
 
     ``rays`` are those of the frame so far, by ``layout.RAY_KINDS``.  Of rays a path only the whole
@@ -54,7 +60,7 @@ def photons_for(settings: Settings, paths: int, rays: Mapping[str, int]) -> int:
     if settings.photons:
         return settings.photons
     traced = round(sum(rays.values()) / rays["camera"]) if rays["camera"] else RAYS_EXPECTED
-    return int(min(max(settings.photon_share * traced * paths, FEWEST), MOST))
+    return int(min(max(settings.photon_share * traced * paths, fewest), MOST))
 
 
 def cells_of(halvings: int = 0) -> int:
@@ -144,7 +150,13 @@ def plan(context: Context) -> StageSpec | None:
 
 
 class PhotonMap:
-    """Fills the map between epochs; photons of earlier epochs of the frame stay in it."""
+    """Fills the map between epochs; photons of earlier epochs stay in it.
+
+    Attributes:
+        fewest: photons of an epoch at least.
+    """
+
+    fewest = FEWEST
 
     def __init__(
         self,
@@ -175,6 +187,13 @@ class PhotonMap:
         self.virtual_lights = virtual_lights
         self.trace = programs["intersect"].bind_planned("intersect_closest", traced)
         self.trace_items = -(-traits.slots // runs_per_trace)
+
+    def begin_frame(self, changed: bool) -> None:
+        """Forget all photons, unless neither lights nor surfaces have ``changed`` since."""
+        stays = not changed and self.virtual_lights is None and 0 < self.drawn() < MOST_KEPT
+        self.fewest = FEWEST_MORE if stays else FEWEST
+        if not stays:
+            self.clear()
 
     def clear(self) -> None:
         """Forget all photons."""
