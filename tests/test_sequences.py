@@ -6,6 +6,7 @@ import csv
 from pathlib import Path
 
 import numpy as np
+import plot_frames
 import pytest
 from make_references import main as make_references
 
@@ -139,3 +140,21 @@ def test_references_need_a_run_of_marks_and_to_be_there(tmp_path, capsys):
     missing = str(tmp_path / "##.exr")
     assert main(["converge", LIGHT_OFF, "--reference", missing, *frames]) == 2
     assert "00.exr" in capsys.readouterr().err
+
+
+def test_reports_of_sequences_are_drawn_together(tmp_path):
+    for name, errors in (("a", (4.0, 2.0, 1.0)), ("b", (0.5, 0.25))):
+        (tmp_path / name).mkdir()
+        lines = [f"pt,{k},{error}," for k, error in enumerate(errors)]
+        lines = ["contestant,frame,relmse,fresh_relmse", *lines]
+        (tmp_path / name / "frames.csv").write_text("\n".join(lines) + "\n")
+    out = tmp_path / "figure.svg"
+    reports = [f"{title}={tmp_path / name}" for title, name in (("one", "a"), ("two", "b"))]
+    assert plot_frames.main([*reports, "-o", str(out)]) == 0
+    text = out.read_text()
+    assert "relMSE, one" in text and "relMSE, two" in text
+    # A marker for each point, and one in the legend.
+    assert text.count("<polygon") == 5 + 1
+    assert plot_frames.read_frames(tmp_path / "b") == {"pt": [(1.0, 0.5), (2.0, 0.25)]}
+    with pytest.raises(InputError, match="expected frames"):
+        plot_frames.read_frames(tmp_path)

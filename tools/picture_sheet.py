@@ -58,6 +58,27 @@ def render_for(scene: Scene, device: Device, way: Settings, seconds: float) -> I
     return image
 
 
+def denoise_for(scene: Scene, device: Device, seconds: float) -> Image:
+    """Return plain path tracing, denoised: both take so many processor seconds together."""
+    # Tools alone have the denoiser.
+    from render_denoised import denoised
+
+    settings = resolve(scene.render, scene.path, "pt")
+    renderer = Renderer(scene, settings, device, outputs=("albedo", "normal"))
+    begin = time.process_time()
+    renderer.render(spp=1)
+    first = time.process_time() - begin
+    # The first time loads the network.
+    denoised(renderer)
+    begin = time.process_time()
+    denoised(renderer)
+    end = time.process_time() + seconds - first - (time.process_time() - begin)
+    renderer.render(spp=1 << 20, progress=lambda now: time.process_time() < end)
+    image = Image({"rgb": denoised(renderer)}, {"spp": renderer.scheduler.passes})
+    renderer.close()
+    return image
+
+
 def sheet(
     pictures: Sequence[Sequence[np.ndarray]], captions: Sequence[Sequence[str]]
 ) -> np.ndarray:
@@ -90,6 +111,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--reference", type=Path, metavar="FILE.exr", help="to show, and to say the relMSE"
     )
+    parser.add_argument(
+        "--denoised",
+        action="store_true",
+        help="show plain path tracing with Open Image Denoise too (pip install pyoidn)",
+    )
     args = parser.parse_args(arguments)
     reference = read_exr(args.reference).rgb if args.reference else None
     size = args.size if reference is None else (reference.shape[1], reference.shape[0])
@@ -98,8 +124,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     pictures, captions = [], []
     for seconds in args.seconds:
         row, texts = [], []
-        for name, way in args.runs or TALK:
-            image = render_for(scene, device, way, seconds * cores)
+        ways: list[tuple[str, Settings | None]] = [*(args.runs or TALK)]
+        if args.denoised:
+            ways.append(("pt + OIDN", None))
+        for name, way in ways:
+            budget = seconds * cores
+            image = (
+                denoise_for(scene, device, budget)
+                if way is None
+                else render_for(scene, device, way, budget)
+            )
             text = f"{name}, {seconds:g} s"
             worth = f"{text}, {image.stats['spp']} spp"
             if reference is not None:
