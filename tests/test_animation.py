@@ -569,3 +569,9 @@ def in_order(corners, bounds):
     rows = corners.reshape(-1, 9)
     keys = np.round(rows.mean(axis=1) / bounds * 1e3), *np.round(rows / bounds * 1e3).T
     return rows[np.lexsort(keys)]
+
+
+def test_scenes_without_a_gltf_file_have_no_clips():
+    scene = Path(__file__).resolve().parents[1] / "scenes" / "moving" / "door_opens.toml"
+    with pytest.raises(InputError, match="clip: expected a scene with a glTF file"):
+        load_scene(scene, clip="1", moving=True)

@@ -64,12 +64,16 @@ def load_scene(
     """
     path = Path(path)
     animated = moving or time is not None
+    suffixes = set()
 
     def load_mesh_file(path: Path) -> Scene:
+        suffixes.add(path.suffix.lower())
         return _load_mesh_file(path, clip, animated)
 
     is_toml = _suffix(path) == ".toml"
     scene = load_toml(path, load_mesh_file) if is_toml else load_mesh_file(path)
+    if clip is not None and suffixes.isdisjoint(_GLTF):
+        raise InputError(f"{path}: clip: expected a scene with a glTF file, which has named clips")
     count = sum(len(shape.mesh.triangles) for shape in scene.shapes)
     if count == 0:
         why = f" ({'; '.join(scene.notes)})" if scene.notes else ""
