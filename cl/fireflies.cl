@@ -37,6 +37,19 @@ static inline float part_kept(float mean, float count, float bright, float other
     return mean > 0.0f && alike < ENOUGH_ALIKE ? max(alike / ENOUGH_ALIKE, 0.0f) : 1.0f;
 }
 
+/// Find the entry of the pixel with this index in the crop, and those of the eight around it.
+static inline uint pixels_around(__global const Params *params, uint index, uint others[8])
+{
+    const uint column = index % params->crop_width;
+    const uint row = index / params->crop_width;
+    for (uint k = 0; k < 8u; ++k) {
+        const uint place = k < 4u ? k : k + 1u; // not the one in the middle
+        others[k] = pixel_entry_of(params, neighbour(column, place % 3u, params->crop_width),
+                                   neighbour(row, place / 3u, params->crop_height));
+    }
+    return pixel_entry_of(params, column, row);
+}
+
 static inline float luminance_of(__global const float *rgb)
 {
     return LUMINANCE_RED * rgb[0] + LUMINANCE_GREEN * rgb[1] + LUMINANCE_BLUE * rgb[2];
@@ -51,17 +64,11 @@ kernel void weigh_film(__global const Params *params, __global const FilmSum *fi
     const uint index = get_global_id(0);
     if (index >= params->pixel_count)
         return;
-    const uint column = index % params->crop_width;
-    const uint row = index / params->crop_width;
-    const uint pixel = pixel_entry_of(params, column, row);
+    uint around[8];
+    const uint pixel = pixels_around(params, index, around);
     float others = 0.0f;
-    for (uint k = 0; k < 9u; ++k) {
-        if (k == 4u)
-            continue;
-        const uint at = pixel_entry_of(params, neighbour(column, k % 3u, params->crop_width),
-                                       neighbour(row, k / 3u, params->crop_height));
-        others += max(film[at].mean, 0.0f) * (float)film[at].count;
-    }
+    for (uint k = 0; k < 8u; ++k)
+        others += max(film[around[k]].mean, 0.0f) * (float)film[around[k]].count;
     const float mean = film[pixel].mean;
     const float count = (float)film[pixel].count;
     kept[pixel] = part_kept(mean, count, mean + film[pixel].squares / (mean * count), others);
@@ -76,17 +83,11 @@ kernel void weigh_light(__global const Params *params, __global const PixelLight
     const uint index = get_global_id(0);
     if (index >= params->pixel_count)
         return;
-    const uint column = index % params->crop_width;
-    const uint row = index / params->crop_width;
-    const uint pixel = pixel_entry_of(params, column, row);
+    uint around[8];
+    const uint pixel = pixels_around(params, index, around);
     float others = 0.0f;
-    for (uint k = 0; k < 9u; ++k) {
-        if (k == 4u)
-            continue;
-        const uint at = pixel_entry_of(params, neighbour(column, k % 3u, params->crop_width),
-                                       neighbour(row, k / 3u, params->crop_height));
-        others += max(luminance_of(light[at].rgb), 0.0f) * light[at].means;
-    }
+    for (uint k = 0; k < 8u; ++k)
+        others += max(luminance_of(light[around[k]].rgb), 0.0f) * light[around[k]].means;
     const float mean = luminance_of(light[pixel].rgb);
     kept[pixel] = part_kept(mean, light[pixel].means, max(light[pixel].square / mean, mean), others);
 }

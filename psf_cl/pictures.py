@@ -92,9 +92,9 @@ def _finished(
         finished["rgb"] = _restored(renderer, counters)
     elif renderer.pictures.blend:
         finished["rgb"] = _picture(renderer)
-    if "kept" in renderer.buffers:
+    dimmed = {"rgb", "direct"} & aovs.keys() - finished.keys()
+    if dimmed and "kept" in renderer.buffers:
         kept = _in_rows(renderer, renderer.device.read(renderer.buffers["kept"])[:, None])
-        dimmed = {"rgb", "direct"} & aovs.keys() - finished.keys()
         finished |= {name: aovs[name] * kept for name in dimmed}
     return finished
 
