@@ -121,6 +121,35 @@ kernel void freeze_guide(
         }
 }
 
+#if !CELLS
+/// Let what the film holds count for less: samples become fewer, and their mean stays.  One work item W sums, while
+/// no path is on its way.
+///
+/// Squares are those of parts of the sum: the variance of the mean, which is told from them, stays what it is.
+///
+/// reads, writes  film
+kernel void fade_film(__global const Params *params, __global FilmSum *film, const uint planes, const uint halvings)
+{
+    const uint first = get_global_id(0) * W;
+    const uint end = min(first + W, params->pixel_count * planes);
+    for (uint i = first; i < end; ++i) {
+        FilmSum sum = film[i];
+        if (sum.count == 0u)
+            continue;
+        const uint count = max(sum.count >> halvings, 1u);
+        const float part = (float)count / (float)sum.count;
+        for (uint c = 0; c < 3; ++c) {
+            sum.sum[c] *= part;
+            sum.lost[c] *= part;
+        }
+        sum.squares *= part * part;
+        sum.lost_squares *= part * part;
+        sum.count = count;
+        film[i] = sum;
+    }
+}
+#endif
+
 #if AOV_GUIDE
 // Look-ups around what a pixel sees, whose mean is shown.
 #define VIEW_LOOKS 8u

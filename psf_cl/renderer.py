@@ -686,6 +686,11 @@ class Renderer:
                 cells = self.device.read(self.buffers["guide_cells"])
                 if not guide.is_worth_it(cells, self.settings.guide_share):
                     self._guide(False, start)
+                elif start == guide.FIRST_DECISION and not (self.scheduler.first or self.loaded):
+                    halvings = guide.early_halvings(cells, self.settings.guide_share)
+                    for launch, planes in self.fade_film:
+                        launch.set(halvings=halvings)
+                        launch(self.film_items(planes), film.GROUP)
 
     def _freeze_cache(self, start: int) -> None:
         """Let paths of the epoch of pass ``start`` end by what was gathered so far."""
@@ -1026,6 +1031,8 @@ class Renderer:
                 "freeze_guide", self.buffers, fades=0
             )
             self.renew_guide = programs["guide"].bind_planned("renew_guide", self.buffers)
+            shared = self.plan.features["CELLS"].value
+            self.fade_film = [] if shared else self._bind_fading(programs["guide"])
             if "guide_views" in self.buffers:
                 self.view_guide = programs["guide"].bind_planned("view_guide", self.buffers)
         self.freeze_cache: Launch | None = None
@@ -1111,6 +1118,23 @@ class Renderer:
             self._bounce,
             self._counters,
         )
+
+    def _bind_fading(self, program: Program) -> list[tuple[Launch, int]]:
+        planes = [(name, count) for _, name, count in film.PLANES] + [("film_half", 1)]
+        return [
+            (
+                program.bind(
+                    "fade_film",
+                    params=self.buffers["params"],
+                    film=self.buffers[name],
+                    planes=count,
+                    halvings=0,
+                ),
+                count,
+            )
+            for name, count in planes
+            if name in self.buffers
+        ]
 
     def add_launch(self, ring: str, name: str, planes: int, partial: bool) -> Launch:
         """Return what adds ``ring`` to the film ``name``; ``partial``: of a pass not complete."""

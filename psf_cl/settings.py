@@ -174,7 +174,7 @@ class Settings:
     guiding: str = _choice(
         "off", "learned", doc="draw directions by what was learned of where light comes from"
     )
-    guide_cell_size: float = _number(32.0, 1e-3, 1e6, doc="edge of a cell of the guide, pixels")
+    guide_cell_size: float = _number(64.0, 1e-3, 1e6, doc="edge of a cell of the guide, pixels")
     guide_share: float = _number(
         0.75, 0.0, 0.99, doc="part of the directions of a diffuse lobe that the guide draws"
     )

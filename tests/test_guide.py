@@ -392,6 +392,85 @@ def test_guide_that_does_not_pay_is_left_out(small, monkeypatch):
     np.testing.assert_array_equal(image.aovs["samples"], 24)
 
 
+@pytest.mark.parametrize(("halvings", "weight"), [(0, 1), (1, 0.5), (2, 0.25), (3, 0.125)])
+def test_faded_film_keeps_its_means_and_counts_for_less(lane_device, halvings, weight):
+    rng = np.random.default_rng(5)
+    planes, pixels = 3, 37
+    sums = np.zeros(planes * pixels, layout.FILM_SUM.dtype)
+    sums["count"] = 8
+    sums["sum"] = rng.exponential(1e3, (len(sums), 3))
+    sums["lost"] = rng.normal(0, 1e-4, (len(sums), 3))
+    sums["mean"] = sums["sum"].mean(axis=1) / 8
+    sums["squares"] = rng.exponential(1e6, len(sums))
+    sums["lost_squares"] = rng.normal(0, 1e-2, len(sums))
+    sums["count"][:2] = 0, 1
+    sums["count"][-1] = 0
+    params = np.zeros(1, layout.PARAMS.dtype)
+    params[0]["pixel_count"] = pixels
+    film = lane_device.upload("film", sums)
+    features = dict.fromkeys(make_plan(room(), Settings()).features, 0) | {"GUIDE": 1}
+    program = load_program(lane_device, "guide.cl", features)
+    params_buffer = lane_device.upload("params", params)
+    launch = program.bind(
+        "fade_film", params=params_buffer, film=film, planes=planes, halvings=halvings
+    )
+    launch(-(-len(sums) // lane_device.traits.lanes))
+    found = lane_device.read(film)
+    lane_device.release(film, params_buffer)
+    # Nothing was added, or only one sample: no part of that can be taken.
+    weights = np.full(len(sums), weight)
+    weights[[0, 1, -1]] = 1
+    np.testing.assert_array_equal(found["count"], sums["count"] * weights)
+    for name, power in (("sum", 1), ("lost", 1), ("mean", 0), ("squares", 2), ("lost_squares", 2)):
+        factor = (weights**power).reshape(-1, *[1] * (sums[name].ndim - 1))
+        np.testing.assert_allclose(found[name], sums[name] * factor, rtol=1e-6, err_msg=name)
+
+
+def test_first_passes_count_for_less_where_the_guide_stays(small, monkeypatch):
+    """From what is there after 8 and 24 passes of equal weight follows what has other weights."""
+    monkeypatch.setattr(guide, "MOST_NOISE_LEFT", 1.0)
+
+    def images(halvings):
+        monkeypatch.setattr(guide, "EARLY_HALVINGS", ((1.0, halvings),))
+        opened = renderer(small, room(), ("samples", "direct"), sampler="random", **LEARN)
+        found = []
+        for spp in (8, 24):
+            opened.render(spp=spp)
+            found.append(opened.image().aovs)
+        opened.close()
+        return found
+
+    early, even = images(0)
+    again, faded = images(2)
+    np.testing.assert_array_equal(again["rgb"], early["rgb"])
+    np.testing.assert_array_equal(faded["samples"], 8 / 4 + 16)
+    for name in ("rgb", "direct"):
+        late = (24 * even[name].astype(np.float64) - 8 * early[name]) / 16
+        expected = (2 * early[name] + 16 * late) / 18
+        np.testing.assert_allclose(faded[name], expected, rtol=1e-4, atol=1e-5)
+    assert np.abs(faded["rgb"] - even["rgb"]).max() > 1e-2
+
+
+@pytest.mark.parametrize("frames", [False, True])
+def test_what_is_known_from_the_start_is_not_faded(small, monkeypatch, tmp_path, frames):
+    """Neither frames after the first nor renders that begin with a cache fade what they have."""
+    monkeypatch.setattr(guide, "MOST_NOISE_LEFT", 1.0)
+    monkeypatch.setattr(guide, "EARLY_HALVINGS", ((1.0, 2),))
+    opened = renderer(small, room(), ("samples",), **LEARN)
+    opened.render(spp=4)
+    if frames:
+        opened.set_frame(0.0)
+    else:
+        opened.save_cache(tmp_path / "a.cache")
+        opened.close()
+        opened = renderer(small, room(), ("samples",), **LEARN)
+        opened.load_cache(tmp_path / "a.cache")
+    opened.render(spp=16)
+    samples = opened.image().aovs["samples"]
+    opened.close()
+    np.testing.assert_array_equal(samples, 16)
+
+
 def test_guide_comes_back_to_a_sequence_that_changes(small, monkeypatch):
     """Left out on a still scene it stays so; after a change and enough passes it is tried again."""
     monkeypatch.setattr(guide, "PASSES_WITHOUT", 8)

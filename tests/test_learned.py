@@ -127,7 +127,7 @@ def test_bits_with_a_loaded_cache_do_not_depend_on_the_pool_or_a_stop(
         ({"scene": painted(3, emission=(41.0, 30.0, 20.0))}, "is of another scene"),
         ({"max_depth": 3}, "max_depth=16; this one has 3"),
         ({"scene": room(size=(16, 24))}, r"size=\[24, 16\]; this one has \[16, 24\]"),
-        ({"guide_cell_size": 16.0}, "guide_cell_size=32.0; this one has 16.0"),
+        ({"guide_cell_size": 16.0}, "guide_cell_size=64.0; this one has 16.0"),
     ],
 )
 def test_tables_of_something_else_are_refused_in_one_line(small, saved, change, message):

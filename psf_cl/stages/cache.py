@@ -13,9 +13,9 @@ from psf_cl.settings import Settings
 from psf_cl.stages.cells import HEADROOM, brightest, pixel_per_meter
 from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
 
-#: Slots of the table: a slot for so many pixels, within these bounds (a slot takes 84 bytes).
-PIXELS_PER_SLOT = 4
-LEAST_SLOTS, MOST_SLOTS = 1 << 16, 1 << 20
+#: Slots of the table: so many for a pixel, within these bounds (a slot takes 84 bytes).
+SLOTS_PER_PIXEL = 2
+LEAST_SLOTS, MOST_SLOTS = 1 << 16, 1 << 21
 
 #: Visits that the sums of a cell have room for.
 MOST_VISITS = 1 << 28
@@ -23,7 +23,7 @@ MOST_VISITS = 1 << 28
 
 def slots_of(pixel_count: int, halvings: int = 0) -> int:
     """Return the slots of the table."""
-    slots = min(max(slots_for(pixel_count // PIXELS_PER_SLOT), LEAST_SLOTS), MOST_SLOTS)
+    slots = min(max(slots_for(SLOTS_PER_PIXEL * pixel_count), LEAST_SLOTS), MOST_SLOTS)
     return smaller(slots, halvings)
 
 
