@@ -146,6 +146,7 @@ class Renderer:
         self.range_search: range_search.RangeSearch | None = None
         self.rebuilds = self.unbuilt = 0
         self.changed = False
+        self.relit = False
         self.buffers: dict[str, Buffer] = {}
         try:
             self._set_up(plan_for)
@@ -380,12 +381,16 @@ class Renderer:
 
     def _change_lights(self) -> None:
         """Write the light table and the materials anew, by what shines now and where."""
+        before = self.lights, self.material_rows
         self.lights = motion.lights_at(
             self.moving, self.time, self.settings.light_sampling, self.radius, self.lights
         )
+        self.material_rows = tables.material_table(self.scene.materials)
+        now = self.lights, self.material_rows
+        self.relit = any(a.tobytes() != b.tobytes() for a, b in zip(before, now, strict=True))
         if "lights" in self.buffers and len(self.lights):
             self.device.write(self.buffers["lights"], self.lights)
-        self.device.write(self.buffers["materials"], tables.material_table(self.scene.materials))
+        self.device.write(self.buffers["materials"], self.material_rows)
         if self.light_tree is not None:
             self.light_tree.launch.set(near_share=tables.near_share(self.lights))
             self.light_tree.fit(self.lights)
@@ -698,6 +703,10 @@ class Renderer:
         new_frame = start == self.scheduler.first > 0
         if new_frame:
             self.renew_cache(buckets_of(slots), film.GROUP)
+        if new_frame and self.relit:
+            # Half of what a lamp lit that has gone out would outshine what is left for many frames.
+            for name in cache.BUFFERS:
+                self.device.fill(self.buffers[name])
         fades = self._is_new(start) or (new_frame and self.changed)
         self.freeze_cache.set(fades=int(fades))
         self.freeze_cache(slots, film.GROUP)
@@ -819,6 +828,7 @@ class Renderer:
         self.center, self.radius = geometry.center, geometry.radius
         self.cut_out = geometry.cut_out
         self.lights_change = motion.lights_change(self.moving)
+        self.material_rows = tables.material_table(scene.materials)
 
         def or_zeros(table: np.ndarray | None, record: layout.Record) -> np.ndarray:
             return np.zeros(geometry.count, record.dtype) if table is None else table
@@ -829,7 +839,7 @@ class Renderer:
             "faces": lambda: few.faces.reshape(-1),
             "plates": lambda: plates.padded(geometry.count),
             "surfaces": lambda: geometry.surfaces,
-            "materials": lambda: tables.material_table(scene.materials),
+            "materials": lambda: self.material_rows,
             "normals": lambda: or_zeros(geometry.normals, layout.NORMALS),
             "uvs": lambda: or_zeros(geometry.uvs, layout.UVS),
             "colors": lambda: (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from scene_builder import (
     glowing,
     luminance_blocks,
     render,
+    renderer,
     z_scores,
 )
 from test_guide import noisy, room
@@ -22,11 +24,13 @@ from psf_cl.device.program import load_program
 from psf_cl.errors import InputError
 from psf_cl.plan import make_plan
 from psf_cl.scene import primitives, transform
+from psf_cl.scene.load import load_scene
 from psf_cl.settings import Settings
 from psf_cl.stages import cache
 
 CACHE = {"termination": "cache"}
 STEPS = 64.0
+SCENES = Path(__file__).parent.parent / "scenes"
 
 
 @pytest.fixture(scope="module")
@@ -139,6 +143,31 @@ def test_bits_do_not_depend_on_the_pool(device, small):
     image = noisy(small, 20, **settings)
     larger = Device(device.context, replace(device.traits, slots=4096))
     assert noisy(larger, 20, **settings).rgb.tobytes() == image.rgb.tobytes()
+
+
+def test_what_a_lamp_lit_is_forgotten_when_it_goes_out(small):
+    """The lamp goes out after a third of a second; before and after that the cache lasts."""
+    scene = load_scene(SCENES / "moving" / "light_off.toml", moving=True, size=(40, 30))
+    opened = renderer(small, scene, **CACHE)
+    visits, means = [], []
+    for time in (0.0, 0.1, 0.2, 0.4, 0.5, 0.6):
+        if time:
+            opened.set_frame(time)
+        opened.render(spp=16)
+        cells = opened.device.read(opened.buffers["cache_sums"])
+        visits.append(int(cells["count"].sum()))
+        means.append(opened.image().rgb.mean())
+    opened.close()
+    plain = renderer(small, scene)
+    plain.set_frame(0.6)
+    plain.render(spp=64)
+    dark = plain.image().rgb.mean()
+    plain.close()
+    assert visits[1] > 1.2 * visits[0] and visits[2] > visits[1]
+    assert visits[3] < 0.7 * visits[2]
+    assert visits[4] > 1.2 * visits[3]
+    assert min(means[:3]) > 3 * dark
+    np.testing.assert_allclose(means[3:], dark, rtol=0.15)
 
 
 def test_paths_get_shorter_and_a_furnace_keeps_its_light(small):

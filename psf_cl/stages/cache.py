@@ -17,6 +17,9 @@ from psf_cl.stages.spec import BufferSpec, Context, KernelSpec, StageSpec
 SLOTS_PER_PIXEL = 2
 LEAST_SLOTS, MOST_SLOTS = 1 << 16, 1 << 21
 
+#: What it has gathered.
+BUFFERS = ("cache_keys", "cache_full", "cache_sums", "cache_cells")
+
 #: Visits that the sums of a cell have room for.
 MOST_VISITS = 1 << 28
 
