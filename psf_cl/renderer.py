@@ -146,6 +146,7 @@ class Renderer:
         self.range_search: range_search.RangeSearch | None = None
         self.rebuilds = self.unbuilt = 0
         self.changed = False
+        # Lights have changed since the radiance cache was last asked for.
         self.relit = False
         self.buffers: dict[str, Buffer] = {}
         try:
@@ -387,7 +388,7 @@ class Renderer:
         )
         self.material_rows = tables.material_table(self.scene.materials)
         now = self.lights, self.material_rows
-        self.relit = any(a.tobytes() != b.tobytes() for a, b in zip(before, now, strict=True))
+        self.relit |= any(a.tobytes() != b.tobytes() for a, b in zip(before, now, strict=True))
         if "lights" in self.buffers and len(self.lights):
             self.device.write(self.buffers["lights"], self.lights)
         self.device.write(self.buffers["materials"], self.material_rows)
@@ -615,6 +616,7 @@ class Renderer:
         names = learned.table_names(self.settings, str(path))
         buffers = {name: (self.buffers[name].dtype, self.buffers[name].count) for name in names}
         tables, self.loaded = learned.read_learned(path, self._learned_identity(), buffers)
+        self.relit = False
         for name, table in tables.items():
             self.device.write(self.buffers[name], table)
 
@@ -703,7 +705,8 @@ class Renderer:
         new_frame = start == self.scheduler.first > 0
         if new_frame:
             self.renew_cache(buckets_of(slots), film.GROUP)
-        if new_frame and self.relit:
+        if self.relit and start == self.scheduler.first:
+            self.relit = False
             # Half of what a lamp lit that has gone out would outshine what is left for many frames.
             for name in cache.BUFFERS:
                 self.device.fill(self.buffers[name])

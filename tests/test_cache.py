@@ -153,6 +153,8 @@ def test_what_a_lamp_lit_is_forgotten_when_it_goes_out(small):
     for time in (0.0, 0.1, 0.2, 0.4, 0.5, 0.6):
         if time:
             opened.set_frame(time)
+            # Frames of which nothing was rendered must not hide the change.
+            opened.set_frame(time)
         opened.render(spp=16)
         cells = opened.device.read(opened.buffers["cache_sums"])
         visits.append(int(cells["count"].sum()))
