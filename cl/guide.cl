@@ -121,11 +121,11 @@ kernel void freeze_guide(
         }
 }
 
-#if !CELLS
 /// Let what the film holds count for less: samples become fewer, and their mean stays.  One work item W sums, while
 /// no path is on its way.
 ///
-/// Squares are those of parts of the sum: the variance of the mean, which is told from them, stays what it is.
+/// Not where cells share light, which is summed elsewhere, too.  Squares are those of parts of the sum: the variance
+/// of the mean, which is told from them, stays what it is.
 ///
 /// reads, writes  film
 kernel void fade_film(__global const Params *params, __global FilmSum *film, const uint planes, const uint halvings)
@@ -148,7 +148,6 @@ kernel void fade_film(__global const Params *params, __global FilmSum *film, con
         film[i] = sum;
     }
 }
-#endif
 
 #if AOV_GUIDE
 // Look-ups around what a pixel sees, whose mean is shown.

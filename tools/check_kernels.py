@@ -201,9 +201,10 @@ JOBS = {
     ),
 }
 
-#: Tables that are large whatever the scene, made small: simulators are slow.
+#: Tables that are large whatever the scene, and waits that are long: simulators are slow.
 SMALL_TABLES = (
     (psf_cl.stages.guide, "LEAST_SLOTS", 64),
+    (psf_cl.stages.guide, "FIRST_DECISION", 1),
     (psf_cl.stages.cache, "LEAST_SLOTS", 64),
     (psf_cl.stages.material_cells, "LEAST_SLOTS", 64),
     (psf_cl.stages.photons, "CELLS", 64),

@@ -128,19 +128,17 @@ def plan(context: Context) -> StageSpec | None:
         view = BufferSpec("guide_views", layout.GUIDE_VIEW.dtype, context.pixel_count, what, True)
         buffers += (view,)
         views = (KernelSpec("view_guide"),)
-    # The light that cells share is summed elsewhere, too.
-    fades = () if context.on("CELLS") else (KernelSpec("fade_film"),)
     kernels = (
         KernelSpec("renew_guide", record_bytes=4, lanes=False),
         KernelSpec("freeze_guide", record_bytes=4 + sums.itemsize + cells.itemsize, lanes=False),
-        *fades,
+        KernelSpec("fade_film", record_bytes=2 * layout.FILM_SUM.dtype.itemsize),
         *views,
     )
     return StageSpec(
         "guide",
         "directions are drawn by what was learned",
         "guide.cl",
-        flags=("GUIDE", "AOV_GUIDE", "CELLS"),
+        flags=("GUIDE", "AOV_GUIDE"),
         kernels=kernels,
         buffers=buffers,
         per_pass=True,
