@@ -12,6 +12,7 @@ import numpy as np
 from psf_cl.errors import InputError
 from psf_cl.settings import Settings
 from psf_cl.soundness import fault_of_tables
+from psf_cl.stages import cache
 from psf_cl.state_file import read_state, refuse_fault, write_state
 
 _KIND = "cache"
@@ -19,7 +20,7 @@ _KIND = "cache"
 #: Buffers of each table.  The guide's cells are made of its sums before anything reads them.
 _TABLES = {
     "guide": ("guide_keys", "guide_full", "guide_sums"),
-    "cache": ("cache_keys", "cache_full", "cache_sums", "cache_cells"),
+    "cache": cache.BUFFERS,
 }
 
 #: Settings that decide what is in the tables.
